@@ -94,7 +94,7 @@ class DriveConfig(Strict):
     )
     halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
     shutdown_option: int = Field(
-        0, ge=-32768, le=32767, description="605Bh: reaction to 'shutdown' under power; 0 switches it off"
+        0, ge=-32768, le=32767, description="605Bh: reaction to 'shutdown' under power; 0 switches power off"
     )
     disable_option: int = Field(
         1, ge=-32768, le=32767, description="605Ch: reaction to 'disable operation'; 1 brakes first"
@@ -320,7 +320,7 @@ class AxisConfig(OtherChannels):
         if node is not None and node in {self.drive.node_id, self.drive.master_node_id}:
             owner = "drive.node_id" if node == self.drive.node_id else "drive.master_node_id"
             raise wrong(
-                f"node {node} is {owner}; expected another, or no key where the drive sends the reading",
+                f"node {node} is {owner}; expected another, or no key if the drive sends the reading",
                 "load_encoder", "source", "node",
             )  # fmt: skip
         self._check_channels()

@@ -37,9 +37,9 @@ class Encoder(Strict):
     """An encoder: counts per turn and direction."""
 
     counts_per_turn: int = Field(
-        ge=1, le=INT32_MAX, description="counts per turn of its shaft, after multiplication"
+        ge=1, le=INT32_MAX, description="counts per turn of the encoder's shaft, after multiplication"
     )
-    direction: Direction = Field(1, description="-1 if it counts down when the axis turns forward")
+    direction: Direction = Field(1, description="-1 if the encoder counts down when the axis turns forward")
 
     @property
     def scale(self) -> Scale:
@@ -77,8 +77,8 @@ class Source(Strict):
         None,
         ge=2,
         le=2**32,
-        description="reading at which it wraps to zero (single-turn encoder: counts per turn); by default "
-        "the range of the type",
+        description="reading at which the encoder wraps to zero (single-turn encoder: counts per turn); by "
+        "default the range of the type",
     )
 
     @model_validator(mode="after")

@@ -215,7 +215,7 @@ def measure(session: Session, measured: Measured) -> None:
     say(f"recording: {work.folder}, {len(journal.done)} tasks, {len(recording.record)} samples")
     if files.model.exists():
         say(f"what the model lacks: {command('diagnose', work.folder, '--model', files.model)}")
-    say(f"what the simulated drive gets wrong: {command('twin', session.profile, work.folder)}")
+    say(f"deviations of the simulated drive: {command('twin', session.profile, work.folder)}")
 
 
 @taking(opt.CsvFormat)
@@ -321,7 +321,7 @@ def print_calibration(result: Calibration) -> None:
     standing = "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f}"
     apart = ""
     if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
-        apart = f"; {noise.fitted_arcsec:.2f} with what was fitted in addition to the model taken off"
+        apart = f"; {noise.fitted_arcsec:.2f} without the terms fitted in addition to the model"
     say(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}")
     say(f"held out: {fit.held_out.text}")
     if len(result.drift) > 1:

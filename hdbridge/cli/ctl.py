@@ -511,7 +511,7 @@ def queue(
 def compensate(
     daemon: Daemon,
     axis: AxisArgument,
-    scheme: Annotated[Scheme, Argument(metavar="SCHEME", help="`none` switches it off.")],
+    scheme: Annotated[Scheme, Argument(metavar="SCHEME", help="`none` switches the compensation off.")],
 ) -> None:
     """Select the part of the model that compensates: none, synchronous, hysteresis, both or extended.
 

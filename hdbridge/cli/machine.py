@@ -237,7 +237,7 @@ def doctor(
 
     Sends nothing, so it may run next to the daemon.
 
-    Exit status 4 if the master made a mistake, or nothing of the axis was heard.
+    Exit status 4 if the master made a mistake, or no frame of the axis was received.
     """
     from hdbridge.daemon.gateway.trace import Trace
 

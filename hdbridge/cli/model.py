@@ -107,7 +107,7 @@ def rollback(profile: opt.Profile, reason: ReasonOption = "", twin: TwinOption =
 
 
 def discard(profile: opt.Profile, twin: TwinOption = False) -> None:
-    """Discard the pending model; its recording stays."""
+    """Discard the pending model; its recording is kept."""
     store = _store(twin)
     store.discard(_folder(profile))
     say(f"the pending {store.noun} is discarded; its recording is kept")

@@ -166,7 +166,7 @@ def step(
     model: opt.Model = None,
     scheme: Annotated[
         list[Scheme] | None,
-        Option("--scheme", help="Only this scheme; may be repeated. Else all of the model."),
+        Option("--scheme", help="Scheme to test; may be repeated. Default: all schemes of the model."),
     ] = None,
     count: Annotated[int, Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
     step_deg: Annotated[float, Option("--step-deg", help="Step, motor degrees.")] = 43.56,
@@ -333,7 +333,7 @@ def motion(
         bool,
         Option(
             "--measure/--no-measure",
-            help="Measure the response of the axis, or test the one of the model file.",
+            help="Measure the response of the axis, or test that of the model file.",
         ),
     ] = True,
     propose: Annotated[

@@ -124,7 +124,7 @@ def remarks(recording: Recording) -> Iterator[str]:
         yield f"{count} parts were too short and are left out"
     if about.get("zeros_may_differ"):
         yield (
-            "the drive was booted or homed meanwhile: if its encoders lose their zeros then, pass "
+            "the drive was booted or homed in between: if its encoders lost their zeros, pass "
             "--independent-zeros to fit and diagnose"
         )
 

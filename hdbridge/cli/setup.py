@@ -301,7 +301,7 @@ def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> N
 
 
 def value_of(text: str, key: str) -> tuple[str, bool] | None:
-    """Returns the value of ``section.key`` in an axis file's text, and True if it is marked as to fill in."""
+    """Returns the value of ``section.key`` in an axis file's text, and True if it is marked ``fill in``."""
     match = _line(key).search(text)
     if match is None:
         return None

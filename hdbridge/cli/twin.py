@@ -113,7 +113,7 @@ def _learned(
             kept = TwinFile(twin.truth).with_provenance(recordings=[str(each) for each in paths])
             reason = f"learned from {', '.join(each.name for each in paths)}"
             TWINS.propose(files.folder, kept, reason, datetime.now().astimezone(), recording.drive)
-    commit = Command(command("model", "commit", files.folder, "--twin"), "makes it what --simulate uses")
+    commit = Command(command("model", "commit", files.folder, "--twin"), "makes --simulate use it")
     return TwinReport(
         axis.name,
         twin.before,

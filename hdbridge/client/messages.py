@@ -103,7 +103,7 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
     errors.BusError: (503, "The bus is not there"),
     errors.IdentityError: (409, "Not the drive of the axis file"),
     errors.TransitionError: (409, "Not in this state"),
-    errors.SdoError: (502, "The drive did not take or give the object"),
+    errors.SdoError: (502, "The drive refused access to the object"),
     errors.DriveError: (502, "The drive refused"),
     errors.SafetyStop: (409, "Stopped by the supervision"),
     errors.OutputError: (507, "A result could not be written"),
@@ -161,7 +161,7 @@ class LeaseRequest(Request):
     model_config = ConfigDict(json_schema_extra={"examples": [{"client": "cell controller", "force": False}]})
 
     client: Words = Field("", description="name shown to other clients; by default user and process")
-    force: bool = Field(False, strict=True, description="take it from its holder, whose motion is stopped")
+    force: bool = Field(False, strict=True, description="take the lease; the holder's motion is stopped")
 
 
 class LeaseGrant(Report):
@@ -169,19 +169,19 @@ class LeaseGrant(Report):
 
     token: str = Field(description="secret that permits motion", examples=["mZ3sWJx0b0lq"])
     client: str = Field(description="name of the holder")
-    timeout_s: Seconds = Field(description="time without use after which it ends", examples=[5.0])
+    timeout_s: Seconds = Field(description="time without use after which the lease ends", examples=[5.0])
 
 
 class LeaseState(Report):
     """State of the lease, without its token."""
 
-    held: bool = Field(description="True if a client holds it")
+    held: bool = Field(description="True if a client holds the lease")
     client: str | None = Field(None, description="name of the holder", examples=["cell controller"])
-    since: datetime | None = Field(None, description="time at which it was taken")
+    since: datetime | None = Field(None, description="time at which the lease was taken")
     remaining_s: float | None = Field(
-        None, description="time until it expires; each use extends it", examples=[4.2]
+        None, description="time until the lease expires; each use extends it", examples=[4.2]
     )
-    timeout_s: float = Field(description="time without use after which it ends", examples=[5.0])
+    timeout_s: float = Field(description="time without use after which the lease ends", examples=[5.0])
 
 
 # ---------------------------------------- requests
@@ -258,14 +258,14 @@ class StreamPoint(Request):
     )
     position_deg: Angle = Field(description="load angle then, degrees", examples=[10.002])
     velocity_deg_s: Velocity | None = Field(
-        None, description="speed then, deg/s; else the slope between its neighbours", examples=[0.2]
+        None, description="speed at this point, deg/s; else the slope between its neighbours", examples=[0.2]
     )
 
 
 class Compensate(Request):
     """Select the parts of the model that compensate; the change is ramped."""
 
-    scheme: Scheme = Field(description="`none` switches it off", examples=["both"])
+    scheme: Scheme = Field(description="`none` switches the compensation off", examples=["both"])
 
 
 class SwitchLoadLoop(Request):
@@ -278,7 +278,7 @@ class ActivateModel(Request):
     """Activate a model of the axis's history, also during motion; the change is ramped."""
 
     version: Annotated[int, Field(strict=True, ge=1, le=10**9)] | Literal["pending", "active"] = Field(
-        description="its number in `hdbridge model log`; `pending` commits the one that waits, `active` "
+        description="number in `hdbridge model log`; `pending` commits the pending one, `active` "
         "reads the active one again",
         examples=[4],
     )
@@ -422,7 +422,7 @@ class LiveOptions(Request):
     """Options of the live feed, sent as the first message and again to change them."""
 
     every: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
-        1, description="decimation: only cycles whose number it divides", examples=[10]
+        1, description="decimation: only cycles whose number is a multiple of this", examples=[10]
     )
     axes: list[Name] | None = Field(
         None, max_length=AXES_MAXIMUM, description="selected axes; by default all"
@@ -460,11 +460,11 @@ class StreamAnswer(Report):
 class Fault(Report):
     """Cause of a stop, latched until a reset."""
 
-    name: str = Field(description="the row of the fault table", examples=["LOST_TPDO"])
+    name: str = Field(description="row of the fault table", examples=["LOST_TPDO"])
     text: str = Field(description="what happened, in words", examples=["a TPDO is missing, twice in a row"])
     hint: str = Field(description="advice to the user", examples=["check the cable"])
-    cycle: int | None = Field(None, description="cycle of the loop in which it was seen")
-    date: datetime | None = Field(None, description="when it was seen, by the machine's clock")
+    cycle: int | None = Field(None, description="cycle in which the fault was detected")
+    date: datetime | None = Field(None, description="time of detection, by the machine's clock")
     needs_verification: bool = Field(
         False, description="the reset boots and verifies the drive again before it releases the latch"
     )
@@ -486,8 +486,8 @@ class Limits(Report):
 class ModelInUse(Report):
     """Model that compensates an axis."""
 
-    version: int | None = Field(None, description="number in the history; None without one", examples=[4])
-    file: str = Field(description="its file on the daemon's machine")
+    version: int | None = Field(None, description="number in the history; None if not in it", examples=[4])
+    file: str = Field(description="model file on the daemon's machine")
     date: datetime | None = Field(None, description="time of its creation")
     age_s: float | None = Field(None, ge=0, description="age, seconds")
     reason: str = Field("", description="reason for its creation", examples=["calibration"])
@@ -497,7 +497,7 @@ class ModelInUse(Report):
 class LoadLoopState(Report):
     """State of the load loop, a slow integral of the measured error."""
 
-    configured: bool = Field(description="True if the machine file has one for this axis")
+    configured: bool = Field(description="True if the machine file has a load loop for this axis")
     on: bool = False
     correction_arcsec: float = Field(0.0, description="present correction")
     doubt: str | None = Field(
@@ -510,9 +510,9 @@ class LoadLoopState(Report):
 class RefinedResponse(Report):
     """Response in motion that replaces that of the model."""
 
-    date: datetime | None = Field(None, description="when it was refined last; None: before the daemon began")
-    low_hz: float = Field(description="lowest frequency at which it differs by 1 % or more")
-    high_hz: float = Field(description="highest one", examples=[62.0])
+    date: datetime | None = Field(None, description="last refinement; None: before the daemon began")
+    low_hz: float = Field(description="lowest frequency at which the response differs by 1 % or more")
+    high_hz: float = Field(description="highest such frequency", examples=[62.0])
     percent: float = Field(description="largest difference", examples=[12.0])
     at_hz: float = Field(description="frequency of the largest difference")
 
@@ -529,29 +529,29 @@ class AdaptationState(Report):
 
     mode: AdaptationMode = AdaptationMode.OFF
     frozen: str | None = Field(
-        None, description="reason why the parameters do not change now; None while they do"
+        None, description="reason why no parameter changes at present; None while they do"
     )
-    updated: datetime | None = Field(None, description="when a parameter was changed last")
+    updated: datetime | None = Field(None, description="time of the last change of a parameter")
     parameters: dict[str, float] = Field(
         default={},
         description="estimated change of each parameter since the model was activated, in its own unit",
         examples=[{"hysteresis.offset_arcsec": 1.3}],
     )
-    response: RefinedResponse | None = Field(None, description="None while the model's is used")
+    response: RefinedResponse | None = Field(None, description="None while the model's own response is used")
 
 
 class OuterState(Report):
     """Axis as a drive of another master, through the gateway."""
 
-    node_id: int = Field(ge=1, le=255, description="on the bus of that master; 255: LSS took it away")
+    node_id: int = Field(ge=1, le=255, description="node id on the other master's bus; 255: removed by LSS")
     alive: bool = Field(description="True if the gateway process runs")
     nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
-    statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
-    error_code: int = Field(0, description="603Fh as that master sees it; 0: no error", examples=[0x8700])
-    error: str | None = Field(None, description="that error with its cause", examples=["8700h: SYNC is late"])
-    period_s: float | None = Field(None, description="period of that master's SYNC", examples=[0.004])
+    statusword: int = Field(description="6041h as read by the other master", examples=[0x1237])
+    error_code: int = Field(0, description="603Fh as read by the other master; 0: none", examples=[0x8700])
+    error: str | None = Field(None, description="error with its cause", examples=["8700h: SYNC is late"])
+    period_s: float | None = Field(None, description="period of the other master's SYNC", examples=[0.004])
     jitter_s: float | None = Field(
-        None, description="mean deviation of that SYNC from its regular time", examples=[2e-5]
+        None, description="mean deviation of the SYNC from its regular time", examples=[2e-5]
     )
     latency_s: float | None = Field(
         None,
@@ -559,14 +559,14 @@ class OuterState(Report):
         "without targets",
         examples=[0.0061],
     )
-    latency_99_s: float | None = Field(None, description="99th percentile of that time", examples=[0.008])
+    latency_99_s: float | None = Field(None, description="99th percentile of the same time", examples=[0.008])
 
 
 class AxisState(Report):
     """State of one axis in the newest cycle."""
 
     name: Name
-    profile: str = Field(description="folder of its files on the daemon's machine")
+    profile: str = Field(description="folder of the axis's files on the daemon's machine")
     node_id: int = Field(ge=1, le=127)
     ratio: float = Field(description="turns of the motor for one of the load, with its sign", examples=[50.0])
     state: ControlState
@@ -588,11 +588,11 @@ class AxisState(Report):
     )
 
     scheme: Scheme = Field(description="parts of the model that compensate")
-    compensating: bool = Field(description="True if the correction is in the target now")
-    correction_arcsec: float | None = Field(None, description="in the target now")
-    predicted_arcsec: float | None = Field(None, description="transmission error by the model, now")
-    weight: float | None = Field(None, description="fraction of the correction that is ramped in, 0 to 1")
-    limited: bool = Field(False, description="the correction is at its limit or changes as fast as it may")
+    compensating: bool = Field(description="True if the present target contains a correction")
+    correction_arcsec: float | None = Field(None, description="correction in the present target")
+    predicted_arcsec: float | None = Field(None, description="present transmission error by the model")
+    weight: float | None = Field(None, description="fraction of the correction in effect, 0 to 1")
+    limited: bool = Field(False, description="the correction or its rate is at its limit")
     changing: bool = Field(False, description="a change of model or scheme is being ramped")
     memory_known: bool = Field(
         description="True if the state of the hysteresis is known: the axis has turned past its width both "
@@ -609,7 +609,7 @@ class AxisState(Report):
     advice: list[str] = Field(
         default=[],
         description="verdict of the load-encoder watch",
-        examples=[["recalibrate: the residual left what the model's intervals allow"]],
+        examples=[["recalibrate: the residual exceeds the model's intervals"]],
     )
     queued: int = Field(0, ge=0, description="waiting way points")
 
@@ -621,8 +621,10 @@ class BusState(Report):
     channel: str = Field(examples=["can0"])
     up: bool
     lent_to: str | None = Field(None, description="program that has borrowed the bus; the axes are disabled")
-    lent_s: float | None = Field(None, ge=0, description="since it was lent, seconds", examples=[63.0])
-    load: float | None = Field(None, description="fraction of the bus's time that is in use", examples=[0.31])
+    lent_s: float | None = Field(
+        None, ge=0, description="time since the loan began, seconds", examples=[63.0]
+    )
+    load: float | None = Field(None, description="fraction of the time that the bus is busy", examples=[0.31])
 
 
 class CycleState(Report):
@@ -630,7 +632,7 @@ class CycleState(Report):
 
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
-    alive: bool = Field(description="True if the loop has turned recently")
+    alive: bool = Field(description="True if the loop has completed a cycle recently")
     pid: int = Field(0, ge=0, description="process id of the control process; 0 if there is none")
     skipped: int = Field(0, ge=0, description="periods left out because the loop was late")
     late_us: float | None = Field(None, description="lateness of the newest cycle")
@@ -642,7 +644,7 @@ class RecorderState(Report):
 
     on: bool
     folder: str | None = None
-    dropped: int = Field(0, ge=0, description="samples that were not written, a full disk for example")
+    dropped: int = Field(0, ge=0, description="samples not written, for example because of a full disk")
     note: str | None = Field(None, description="remarks for the user", examples=["the disk is full"])
 
 
@@ -650,8 +652,8 @@ class MachineState(Report):
     """State of the machine in the newest cycle."""
 
     name: Name
-    version: str = Field(description="of hdbridge")
-    started: datetime = Field(description="when the service began")
+    version: str = Field(description="version of hdbridge")
+    started: datetime = Field(description="time at which the service began")
     simulated: bool = False
     axes: list[AxisState]
     bus: BusState

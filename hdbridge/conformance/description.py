@@ -117,7 +117,9 @@ def _(t: NodeTester) -> Iterator[str]:
                 yield f"{_name(each)}: {_outcome(code)}"
 
 
-@_check("writable", "Parameters that the EDS calls rw take back their value", "the present value is accepted")
+@_check(
+    "writable", "Parameters that the EDS calls rw accept their own value", "the present value is accepted"
+)
 def _(t: NodeTester) -> Iterator[str]:
     for each in _parameters(t):
         data = t.upload(each.index, each.subindex)
@@ -153,7 +155,7 @@ _limit("upper", "max", 1)
 
 @_check(
     "defaults", "After a reset the communication parameters have the defaults of the EDS",
-    "the defaults of the EDS (parameters that were saved differ)",
+    "the defaults of the EDS (saved parameters may differ)",
 )  # fmt: skip
 def _(t: NodeTester) -> Iterator[str]:
     entries = [
@@ -235,10 +237,10 @@ def _(t: NodeTester) -> Iterator[str]:
 
 
 def _count(kind: str, first: int, attribute: str) -> None:
-    @check(f"eds.pdos.{kind}", f"The EDS names as many {kind}s as it says", _EDS)
+    @check(f"eds.pdos.{kind}", f"The EDS lists the number of {kind}s that it states", _EDS)
     def _(t: NodeTester) -> None:
         expected = getattr(t.eds.device_information, f"nr_of_{attribute}")
-        t.need(expected is not None, f"the EDS does not say how many {kind}s there are")
+        t.need(expected is not None, f"the EDS does not state the number of {kind}s")
         found = sum(t.has(index, 1) for index in range(first, first + 0x200) if index in t.eds)
         t.equal(found, expected, f"number of {kind}s")
 

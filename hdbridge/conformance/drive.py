@@ -4,12 +4,20 @@ import struct
 from typing import Final
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.steps import control, holds, reaches, reads, refuses, reset_node, stays
+from hdbridge.conformance.steps import (
+    control,
+    holds,
+    parametrised,
+    reaches,
+    reads,
+    refuses,
+    reset_node,
+    stays,
+)
 from hdbridge.conformance.tester import (
     RANGE,
     READ_ONLY,
     NodeTester,
-    Step,
     Table,
     expedited,
     pack,
@@ -46,26 +54,22 @@ def _(t: NodeTester) -> None:
     )
 
 
-def _is_mandatory(index: int, size: int, *, writable: bool) -> Step:
-    def step(t: NodeTester) -> None:
-        data = t.upload(index)
-        t.equal(len(data), size, "bytes")
-        if not writable:
-            t.aborts(expedited(index, 0, data), READ_ONLY, f"download to {index:04X}h")
-
-    return step
+@parametrised
+def _is_mandatory(t: NodeTester, index: int, size: int, *, writable: bool) -> None:
+    data = t.upload(index)
+    t.equal(len(data), size, "bytes")
+    if not writable:
+        t.aborts(expedited(index, 0, data), READ_ONLY, f"download to {index:04X}h")
 
 
-def _takes_mode(number: int) -> Step:
-    def step(t: NodeTester) -> None:
-        if t.read(0x6502) >> number - 1 & 1:
-            t.write(0x6060, 0, number, 1)
-            t.wait(0.05)
-            t.equal(t.read(0x6061, signed=True), number, "6061h")
-        else:
-            _refuses_mode(t, number)
-
-    return step
+@parametrised
+def _takes_mode(t: NodeTester, number: int) -> None:
+    if t.read(0x6502) >> number - 1 & 1:
+        t.write(0x6060, 0, number, 1)
+        t.wait(0.05)
+        t.equal(t.read(0x6061, signed=True), number, "6061h")
+    else:
+        _refuses_mode(t, number)
 
 
 def _refuses_mode(t: NodeTester, number: int) -> None:
@@ -106,8 +110,9 @@ def ready(t: NodeTester) -> None:
     t.reaches(_READY)
 
 
-def _bit(bit: int, value: int) -> Step:
-    return lambda t: t.equal(t.read(0x6041) >> bit & 1, value, f"bit {bit}")
+@parametrised
+def _bit(t: NodeTester, bit: int, value: int) -> None:
+    t.equal(t.read(0x6041) >> bit & 1, value, f"bit {bit}")
 
 
 CHECKS.rows(
@@ -194,16 +199,13 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- option codes
 
 
-def _holds_one_of(index: int, defined: tuple[int, ...]) -> Step:
+@parametrised
+def _holds_one_of(t: NodeTester, index: int, defined: tuple[int, ...]) -> None:
     """A signed object of two bytes has a defined value or one of the manufacturer, which is negative."""
-
-    def step(t: NodeTester) -> None:
-        data = t.upload(index)
-        t.equal(len(data), 2, "bytes")
-        value = int.from_bytes(data, "little", signed=True)
-        t.true(value in defined or value < 0, f"{index:04X}h = {value}", f"one of {defined}")
-
-    return step
+    data = t.upload(index)
+    t.equal(len(data), 2, "bytes")
+    value = int.from_bytes(data, "little", signed=True)
+    t.true(value in defined or value < 0, f"{index:04X}h = {value}", f"one of {defined}")
 
 
 for _index, _name, _reserved, _defined in (
@@ -226,12 +228,10 @@ for _index, _name, _reserved, _defined in (
 # ---------------------------------------------------------------- units and limits
 
 
-def _are_positive(index: int) -> Step:
-    def step(t: NodeTester) -> None:
-        found = [t.read(index, sub) for sub in (1, 2)]
-        t.true(all(found), f"{index:04X}h = {found}", "both above 0")
-
-    return step
+@parametrised
+def _are_positive(t: NodeTester, index: int) -> None:
+    found = [t.read(index, sub) for sub in (1, 2)]
+    t.true(all(found), f"{index:04X}h = {found}", "both above 0")
 
 
 CHECKS.rows(
@@ -256,7 +256,7 @@ def _(t: NodeTester) -> None:
     scale = feed * shaft * turns / (increments * motor * driven)
     offset = t.read(0x607C, signed=True) if t.has(0x607C) else 0
     internal, actual = t.read(0x6063, signed=True), t.read(0x6064, signed=True)
-    t.need(abs(internal) > 1000, "the axis is too near to zero to see a scale")
+    t.need(abs(internal) > 1000, "the axis is too close to zero to check the scale")
     t.true(
         abs(abs(actual - offset) - abs(internal) * scale) <= 2 + 0.001 * abs(internal) * scale,
         f"6064h = {actual} at 6063h = {internal}", f"{internal * scale:.0f}",

@@ -1,12 +1,11 @@
 """Checks of EMCY, the error objects, stored parameters and identity."""
 
-from collections.abc import Callable
 from typing import Final
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.network import lose_heartbeat
 from hdbridge.conformance.steps import aborts, has_bits, holds, no_emergency, puts, reads, reset_node, waits
-from hdbridge.conformance.tester import PDO_INVALID, RANGE, READ_ONLY, NodeTester, Table, expedited
+from hdbridge.conformance.tester import PDO_INVALID, RANGE, READ_ONLY, NodeTester, Step, Table, expedited
 
 CHECKS: Final = Table()
 check: Final = CHECKS.check
@@ -67,7 +66,7 @@ CHECKS.rows(
      holds(0x1003, 0, 1)),
     ("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", 0x1003, lose_heartbeat,
      _clear_history, holds(0x1003, 0, 0)),
-    ("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", 0x1003,
+    ("emcy.history.write", "Any other value written to 1003h:00 is refused with abort 06090030h", 0x1003,
      aborts(expedited(0x1003, 0, b"\x01"), RANGE, "1003h:00 = 1")),
 )  # fmt: skip
 
@@ -158,29 +157,27 @@ def _saved(t: NodeTester, value: int) -> None:
 
 def _forget(t: NodeTester) -> None:
     t.download(0x1011, 1, _LOAD)
-    t.reset(NmtCommand.RESET_NODE)
+    reset_node(t)
 
 
-def _stored(name: str, text: str, act: Callable[[NodeTester], object], what: str = "1017h") -> None:
+def _stored(name: str, text: str, *act: Step) -> None:
     @check(f"store.{name}", text, _STORE, stores=True)
     def _(t: NodeTester) -> None:
         _saved(t, 700)
-        act(t)
+        for step in act:
+            step(t)
         found = t.read(0x1017)
         _forget(t)
-        t.equal(found, 700, what)
-
-
-def _overwrite(t: NodeTester) -> None:
-    t.put(0x1017, 0, 800, 2)
-    t.reset(NmtCommand.RESET_NODE)
+        t.equal(found, 700, "1017h")
 
 
 _stored("save", "Saved parameters survive a reset", reset_node)
-_stored("unsaved", "Parameters that were not saved do not survive a reset", _overwrite)
+_stored(
+    "unsaved", "Parameters that were not saved do not survive a reset", puts(0x1017, 0, 800, 2), reset_node
+)
 _stored(
     "load.later", "Default values become valid at the next reset, not at once",
-    lambda t: t.download(0x1011, 1, _LOAD), "1017h before the reset",
+    lambda t: t.download(0x1011, 1, _LOAD),
 )  # fmt: skip
 
 
@@ -198,5 +195,5 @@ def _(t: NodeTester) -> None:
     before = t.read(0x1017)
     t.put(0x1017, 0, before + 300, 2)
     t.ask(expedited(0x1010, 1, b"evas"))
-    t.reset(NmtCommand.RESET_NODE)
+    reset_node(t)
     t.equal(t.read(0x1017), before, "1017h")

@@ -67,8 +67,8 @@ def _set_node_id(t: NodeTester, identity: list[int], node_id: int) -> None:
 
 
 def _restore_node_id(t: NodeTester, identity: list[int], now: int) -> None:
-    """Restores the node's own node id; sends all requests before it waits, so that the user's stop cannot
-    prevent them.
+    """Restores the node's own node id. All requests are sent before the first wait, so an interruption by the
+    user cannot prevent them.
     """
     requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
     since = len(t.log)

@@ -8,13 +8,12 @@ from typing import Final, Self
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.drive import MODES
-from hdbridge.conformance.steps import control, has_bits, holds, reads, stays, waits
+from hdbridge.conformance.steps import control, has_bits, holds, parametrised, reads, reset_node, stays, waits
 from hdbridge.conformance.tester import (
     ENABLING,
     Decorator,
     NodeTester,
     NotApplicableError,
-    Step,
     Table,
     expedited,
     pack,
@@ -51,13 +50,13 @@ def _position(t: NodeTester) -> int:
     return t.read(0x6064, signed=True)
 
 
-def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None:
-    """Fails if the axis moves by more than the fraction ``within`` of the test distance."""
+def _stands(t: NodeTester, duration_s: float = 0.1) -> None:
+    """Fails if the axis moves by more than a tenth of the test distance."""
     start, end_s = _position(t), t.now + duration_s
     while t.now < end_s:
         t.wait(0.01)
         moved = abs(_position(t) - start)
-        t.true(moved <= max(2.0, within * t.travel), f"the axis moves: {moved} units", "standstill")
+        t.true(moved <= max(2.0, 0.1 * t.travel), f"the axis moves: {moved} units", "standstill")
 
 
 def _moved_at_most(t: NodeTester, before: int, most: float, now: int | None = None) -> None:
@@ -133,21 +132,16 @@ def _reset_fault(t: NodeTester, word: int = 0x80) -> None:
 # ---------------------------------------------------------------- transitions
 
 
-def _in(state: State) -> Step:
-    """Brings the drive to a power state, at rest."""
-    return lambda t: _bring(t, state)
+_in = parametrised(_bring)
 
 
-def _leads(word: int, state: State) -> Step:
+@parametrised
+def _leads(t: NodeTester, word: int, state: State) -> None:
     """A controlword leads to a state without motion."""
-
-    def step(t: NodeTester) -> None:
-        before = _position(t)
-        t.control(word)
-        t.reaches(state)
-        _moved_at_most(t, before, t.travel)
-
-    return step
+    before = _position(t)
+    t.control(word)
+    t.reaches(state)
+    _moved_at_most(t, before, t.travel)
 
 
 CHECKS.rows(
@@ -188,7 +182,7 @@ CHECKS.rows(
 
 @check(
     "402.fault.reset.edge",
-    "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault", _STATES,
+    "A fault is reset by a rising edge of bit 7, not while bit 7 is held", _STATES,
     _in(_FAULT), control(0x00),
 )  # fmt: skip
 def _(t: NodeTester) -> None:
@@ -230,29 +224,32 @@ CHECKS.rows(
 # ---------------------------------------------------------------- option codes
 
 
-def _lost_master(code: int, states: tuple[State, ...], text: str) -> None:
-    @check(f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", _OPTIONS, 0x6007)
-    def _(t: NodeTester) -> None:
-        mode = _some_mode(t)
-        t.disable()
-        _select(t, mode)
-        t.write(0x6007, 0, code, 2)
-        t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
-        t.be_supervised(300)
-        _enable_and_beat(t)
-        _lose_master(t, *states)
-        if not code:
-            t.stays(_ENABLED, 0.1)
+@parametrised
+def _lost_master(t: NodeTester, code: int, *states: State) -> None:
+    mode = _some_mode(t)
+    t.disable()
+    _select(t, mode)
+    t.write(0x6007, 0, code, 2)
+    t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
+    t.be_supervised(300)
+    _enable_and_beat(t)
+    _lose_master(t, *states)
+    if not code:
+        t.stays(_ENABLED, 0.1)
 
 
-_lost_master(0, (_ENABLED,), "changes nothing")
-_lost_master(1, (_FAULT,), "is a fault")
-_lost_master(2, (_DISABLED,), "disables the voltage")
-_lost_master(3, (_STOPPED, _DISABLED), "is a quick stop")
+CHECKS.rows(
+    _OPTIONS,
+    *((f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", 0x6007,
+       _lost_master(code, *states))
+      for code, text, *states in (
+          (0, "changes nothing", _ENABLED), (1, "leads to a fault", _FAULT),
+          (2, "disables the voltage", _DISABLED), (3, "leads to a quick stop", _STOPPED, _DISABLED))),
+)  # fmt: skip
 
 
 def _stopping(index: int, code: int, word: int, state: State, name: str) -> None:
-    text = f"{name} of a move with {index:04X}h = {code}: {state.value}"
+    text = f"{index:04X}h = {code}: {name} during a move leads to {state.value}"
 
     @check(f"402.option.{index:04X}.{code}", text, _OPTIONS, index)
     def _(t: NodeTester) -> None:
@@ -278,18 +275,18 @@ def _set_if_supported(t: NodeTester, index: int, value: int, before: int, size: 
 
 
 for _index, _codes, _word, _state, _name in (
-    (0x605A, (0, 1, 2), 0x02, _DISABLED, "Quick stop"),
-    (0x605A, (5, 6), 0x02, _STOPPED, "Quick stop"),
-    (0x605B, (0, 1), 0x06, _READY, "Shutdown"),
-    (0x605C, (0, 1), 0x07, _SWITCHED_ON, "Disable operation"),
-    (0x605D, (1, 2), 0x10F, _ENABLED, "Halt"),
+    (0x605A, (0, 1, 2), 0x02, _DISABLED, "quick stop"),
+    (0x605A, (5, 6), 0x02, _STOPPED, "quick stop"),
+    (0x605B, (0, 1), 0x06, _READY, "shutdown"),
+    (0x605C, (0, 1), 0x07, _SWITCHED_ON, "disable operation"),
+    (0x605D, (1, 2), 0x10F, _ENABLED, "halt"),
 ):
     for _code in _codes:
         _stopping(_index, _code, _word, _state, _name)
 
 
 def _reaction(code: int) -> None:
-    text = f"A fault in a move with 605Eh = {code} ends in fault, at rest"
+    text = f"605Eh = {code}: a fault during a move leads to fault, at rest"
 
     @check(f"402.option.605E.{code}", text, _OPTIONS, 0x605E, 0x6007)
     def _(t: NodeTester) -> None:
@@ -386,9 +383,9 @@ def _limited(t: NodeTester, here: int, side: int, distance: int) -> Callable[[in
     return within
 
 
-def _arrives(t: NodeTester, target: int, timeout_s: float = 10.0) -> None:
+def _arrives(t: NodeTester, target: int) -> None:
     """Waits until the drive reports target reached and the axis is at the target; fails on time-out."""
-    end_s = t.now + timeout_s
+    end_s = t.now + 10.0
     while not t.read(0x6041) & _REACHED or abs(_position(t) - target) > _window(t):
         if t.now > end_s:
             t.fail(f"position {_position(t)}, statusword {t.read(0x6041):04X}h", f"{target}, target reached")
@@ -405,18 +402,14 @@ def _(t: NodeTester) -> None:
     _moved_at_most(t, before, 0.5 * t.travel)
 
 
-def _begins(distances: int) -> Step:
-    return lambda t: _begin_move(t, distances)
+_begins = parametrised(_begin_move)
 
 
 def _put_target(t: NodeTester) -> None:
     t.put(0x607A, 0, _ahead(t, 3), 4)
 
 
-def _stands_long(t: NodeTester) -> None:
-    _stands(t, 0.3)
-
-
+_stands_long = parametrised(_stands)(0.3)
 CHECKS.rows(
     _PP,
     ("402.pp.move", "A new set-point is reached", _enable_slowly, lambda t: _arrives(t, _begin_move(t, 2))),
@@ -427,7 +420,7 @@ CHECKS.rows(
      _begins(2), control(0x0F), waits(0.05), has_bits(0x6041, _BIT_12, 0, "bit 12")),
     ("402.pp.target-alone", "A target without a new set-point moves nothing", _enable_slowly, _put_target,
      control(0x0F), _stands_long),
-    ("402.pp.stale", "A target from before enabling moves nothing", _select_slowly, _put_target,
+    ("402.pp.stale", "A target written before enabling moves nothing", _select_slowly, _put_target,
      NodeTester.walk, _stands_long),
 )  # fmt: skip
 
@@ -439,7 +432,7 @@ def _(t: NodeTester) -> None:
     _arrives(t, target)
 
 
-@_pp("held", "Bit 4 that is held does not start a second move")
+@_pp("held", "Holding bit 4 does not start a second move")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 2)
     _arrives(t, target)
@@ -448,7 +441,7 @@ def _(t: NodeTester) -> None:
     _stands(t, 0.3)
 
 
-@_pp("relative", "A relative set-point counts from the one before")
+@_pp("relative", "A relative set-point is added to the previous set-point")
 def _(t: NodeTester) -> None:
     first = _begin_move(t, 1)
     _arrives(t, first)
@@ -458,7 +451,7 @@ def _(t: NodeTester) -> None:
     _arrives(t, first + distance)
 
 
-@_pp("again", "A set-point where the axis is already is acknowledged and reached")
+@_pp("again", "A set-point at the present position is acknowledged and reached")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 1)
     _arrives(t, target)
@@ -522,7 +515,7 @@ def _(t: NodeTester) -> None:
     t.stays(_ENABLED)
 
 
-@_pp("halt.end", "When halt ends the move is continued")
+@_pp("halt.end", "The move continues when halt ends")
 def _(t: NodeTester) -> None:
     target = _begin_move(t, 4)
     t.control(0x11F)
@@ -557,7 +550,7 @@ def _ends_the_move(name: str, text: str, act: Callable[[NodeTester], None]) -> N
 
 
 def _resets(t: NodeTester) -> None:
-    t.reset(NmtCommand.RESET_NODE)
+    reset_node(t)
     t.reaches(_DISABLED)
 
 
@@ -691,9 +684,7 @@ def _(t: NodeTester) -> None:
     _stands(t)
 
 
-@check(
-    "402.csp.lost-heartbeat", "A lost heartbeat stops the axis and takes it out of operation enabled", _CSP
-)
+@check("402.csp.lost-heartbeat", "A lost heartbeat stops the axis and ends operation enabled", _CSP)
 def _(t: NodeTester) -> None:
     t.require(0x6007)
     stream = _Stream(t)
@@ -754,7 +745,7 @@ def _home(t: NodeTester, offset: int) -> None:
 
 
 def _homing(method: int) -> None:
-    text = f"Homing method {method} makes the present position 607Ch, without motion"
+    text = f"Homing method {method} sets the present position to 607Ch, without motion"
 
     @check(f"402.homing.{method}", text, _HM, 0x607C)
     def _(t: NodeTester) -> None:

@@ -7,13 +7,12 @@ from statistics import median
 from typing import Any, Final
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.steps import has_bits, refuses, writes
+from hdbridge.conformance.steps import has_bits, parametrised, refuses, writes
 from hdbridge.conformance.tester import (
     ABSENT,
     PDO_INVALID,
     RANGE,
     NodeTester,
-    Step,
     Table,
     abort_code,
     abort_codes,
@@ -114,15 +113,12 @@ for _first in (_TPDO, _RPDO):
         _transmission_type(_first, _value, allowed=False)
 
 
-def _is_fixed(first: int, sub: int, change: Callable[[int], bytes]) -> Step:
+@parametrised
+def _is_fixed(t: NodeTester, first: int, sub: int, change: Callable[[int], bytes]) -> None:
     """An entry of a PDO that exists cannot be changed."""
-
-    def step(t: NodeTester) -> None:
-        t.map_pdo(first, (t.scratch() if first == _RPDO else _REGISTER,), 255)
-        t.require(first, sub)
-        t.refuses(expedited(first, sub, change(t.read(first, sub))), "change while the PDO exists")
-
-    return step
+    t.map_pdo(first, (t.scratch() if first == _RPDO else _REGISTER,), 255)
+    t.require(first, sub)
+    t.refuses(expedited(first, sub, change(t.read(first, sub))), "change while the PDO exists")
 
 
 CHECKS.rows(
@@ -242,20 +238,22 @@ def _sent(
     return used
 
 
-def _every(number: int) -> None:
-    @check(f"tpdo.sync.{number}", f"Transmission type {number}: a TPDO at every {number}. SYNC", _PDO)
-    def _(t: NodeTester) -> None:
-        can_id = _sent(t, (_REGISTER,), number)
-        answers = _syncs(t, can_id, 3 * number)
-        t.equal(sum(answers), 3, f"TPDOs at {3 * number} SYNCs")
-        t.equal(max(answers), 1, "TPDOs at one SYNC")
-        gaps = [place for place, count in enumerate(answers) if count]
-        t.equal([b - a for a, b in pairwise(gaps)], [number, number], "SYNCs between TPDOs")
+@parametrised
+def _sends_every(t: NodeTester, number: int) -> None:
+    """The node sends a TPDO once in ``number`` SYNCs."""
+    can_id = _sent(t, (_REGISTER,), number)
+    answers = _syncs(t, can_id, 3 * number)
+    t.equal(sum(answers), 3, f"TPDOs at {3 * number} SYNCs")
+    t.equal(max(answers), 1, "TPDOs at one SYNC")
+    gaps = [place for place, count in enumerate(answers) if count]
+    t.equal([b - a for a, b in pairwise(gaps)], [number, number], "SYNCs between TPDOs")
 
 
-_every(1)
-_every(2)
-_every(5)
+CHECKS.rows(
+    _PDO,
+    *((f"tpdo.sync.{number}", f"Transmission type {number}: a TPDO every {period}", _sends_every(number))
+      for number, period in ((1, "SYNC"), (2, "second SYNC"), (5, "fifth SYNC"))),
+)  # fmt: skip
 
 
 @check("tpdo.sync.0", "Transmission type 0: a TPDO at the SYNC after a change, and only then", _PDO)
@@ -346,7 +344,7 @@ def _inhibited(t: NodeTester, count: int, pause_s: float) -> tuple[list[Frame], 
     return t.heard(can_id, since), before
 
 
-@check("tpdo.inhibit", "Changes come no faster than the inhibit time", _PDO)
+@check("tpdo.inhibit", "Successive changes are sent at least the inhibit time apart", _PDO)
 def _(t: NodeTester) -> None:
     times = [frame.time_s for frame in _inhibited(t, 8, 0.02)[0]]
     shortest = min((after - start for start, after in pairwise(times)), default=0.0)
@@ -413,22 +411,21 @@ class _Reception:
         return found
 
 
+@parametrised
 def _received(
+    t: NodeTester,
+    /,
     when: str = "after the RPDO",
     act: Callable[[_Reception], None] = _Reception.send,
     transmission: int = 255,
     *,
     taken: bool = False,
     **options: Any,
-) -> Step:
-    """``act`` makes the object hold the value sent if ``taken``, else the original one."""
-
-    def step(t: NodeTester) -> None:
-        rpdo = _Reception(t, transmission, **options)
-        act(rpdo)
-        rpdo.holds(rpdo.value if taken else rpdo.before, when)
-
-    return step
+) -> None:
+    """After ``act``, the object has the value sent if ``taken``, else its original value."""
+    rpdo = _Reception(t, transmission, **options)
+    act(rpdo)
+    rpdo.holds(rpdo.value if taken else rpdo.before, when)
 
 
 def _send_and_sync(rpdo: _Reception) -> None:
@@ -455,15 +452,15 @@ def _send_when_off(rpdo: _Reception) -> None:
 
 CHECKS.rows(
     _PDO,
-    ("rpdo.event", "An RPDO of type 255 is taken at once", _received(taken=True)),
+    ("rpdo.event", "An RPDO of type 255 takes effect at once", _received(taken=True)),
     ("rpdo.sync.before", "A synchronous RPDO has no effect before SYNC",
      _received("before SYNC", transmission=1)),
     ("rpdo.sync.after", "A synchronous RPDO takes effect at SYNC",
      _received("after SYNC", _send_and_sync, 1, taken=True)),
-    ("rpdo.sync.last", "Of two synchronous RPDOs the last one counts",
+    ("rpdo.sync.last", "The last of two synchronous RPDOs takes effect",
      _received("after SYNC", _send_two_and_sync, 1, taken=True)),
     ("rpdo.pre-operational", "An RPDO in PRE-OPERATIONAL has no effect", _received(start=False)),
-    ("rpdo.stale", "An RPDO from before PRE-OPERATIONAL has no effect when the node starts again",
+    ("rpdo.stale", "An RPDO received before PRE-OPERATIONAL has no effect when the node starts again",
      _received("after NMT start and SYNC", _send_and_restart, 1)),
     ("rpdo.disabled", "An RPDO with bit 31 set has no effect", _received(act=_send_when_off)),
     ("rpdo.identifier.other", "An RPDO is received with the identifier that was written",
@@ -473,7 +470,7 @@ CHECKS.rows(
 )  # fmt: skip
 
 
-@check("rpdo.sync.once", "A synchronous RPDO takes effect once", _PDO)
+@check("rpdo.sync.once", "A synchronous RPDO takes effect only once", _PDO)
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 1)
     rpdo.send()
@@ -491,7 +488,7 @@ def _(t: NodeTester) -> None:
     rpdo.holds(rpdo.before, "after the RPDO", rpdo.after(rpdo.data()[:-1]))
 
 
-@check("rpdo.short.emergency", "An RPDO that is too short is EMCY 8210h", "CiA 301, 7.2.7")
+@check("rpdo.short.emergency", "An RPDO that is too short leads to EMCY 8210h", "CiA 301, 7.2.7")
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
     codes = t.emergencies_after(0.05, lambda: rpdo.send(rpdo.data()[:-1]))
@@ -499,7 +496,7 @@ def _(t: NodeTester) -> None:
     t.true(0x8210 in codes, f"EMCY codes {[f'{code:04X}h' for code in codes]}", "8210h")
 
 
-@check("rpdo.long", "Of an RPDO that is too long the first bytes are taken", _PDO)
+@check("rpdo.long", "The first bytes of an RPDO that is too long take effect", _PDO)
 def _(t: NodeTester) -> None:
     rpdo = _Reception(t, 255)
     rpdo.holds(rpdo.value, "after the RPDO", rpdo.after(rpdo.data() + b"\xff"))
@@ -539,15 +536,14 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs at the old SYNC")
 
 
-def _counted(transmission: int, expected: list[int], timers: dict[int, int] | None = None) -> Step:
+@parametrised
+def _counted(
+    t: NodeTester, transmission: int, expected: list[int], timers: dict[int, int] | None = None
+) -> None:
     """Numbers of TPDOs at the SYNCs of a counter from 1 on, which overflows at 10."""
-
-    def step(t: NodeTester) -> None:
-        t.write(0x1019, 0, 10, 1)
-        can_id = _sent(t, (_REGISTER,), transmission, timers=timers)
-        t.equal(_syncs(t, can_id, len(expected), 1), expected, "TPDOs at the counters from 1 on")
-
-    return step
+    t.write(0x1019, 0, 10, 1)
+    can_id = _sent(t, (_REGISTER,), transmission, timers=timers)
+    t.equal(_syncs(t, can_id, len(expected), 1), expected, "TPDOs at the counters from 1 on")
 
 
 CHECKS.rows(
@@ -560,8 +556,8 @@ CHECKS.rows(
 CHECKS.rows(
     _COUNTER,
     ("sync.counter", "SYNC with a counter triggers TPDOs", 0x1019, _counted(1, [1, 1, 1])),
-    ("sync.counter.start", "SYNC start value: the first TPDO comes at this counter", 0x1019, (_TPDO, 6),
-     _counted(2, [0, 0, 1, 0, 1, 0, 1, 0], {6: 3})),
+    ("sync.counter.start", "SYNC start value: the first TPDO is sent at this counter value", 0x1019,
+     (_TPDO, 6), _counted(2, [0, 0, 1, 0, 1, 0, 1, 0], {6: 3})),
     ("sync.overflow.240", "Overflow value 240 in 1019h is accepted", 0x1019, writes(0x1019, 0, 240, 1)),
     ("sync.overflow.1", "Overflow value 1 in 1019h is refused", 0x1019, refuses(0x1019, 0, b"\1", RANGE)),
     ("sync.overflow.241", "Overflow value 241 in 1019h is refused", 0x1019,

@@ -9,7 +9,7 @@ from typing import Final
 from canopen.objectdictionary import datatypes
 
 from hdbridge.cia301 import NmtCommand
-from hdbridge.conformance.steps import aborts, refuses, sends_nmt, waits
+from hdbridge.conformance.steps import aborts, parametrised, refuses, sends_nmt, waits
 from hdbridge.conformance.tester import (
     ABSENT,
     COMMAND,
@@ -82,34 +82,28 @@ def _number(t: NodeTester) -> tuple[int, int, int]:
 # ---------------------------------------------------------------- upload
 
 
-def _is_expedited(index: int, size: int) -> Step:
-    return lambda t: t.equal(
-        t.answer(upload_request(index))[:4],
-        bytes((0x43 | (4 - size) << 2,)) + _mux(index, 0),
-        "command and multiplexer",
-    )
+@parametrised
+def _is_expedited(t: NodeTester, index: int, size: int) -> None:
+    expected = bytes((0x43 | (4 - size) << 2,)) + _mux(index, 0)
+    t.equal(t.answer(upload_request(index))[:4], expected, "command and multiplexer")
 
 
-def _answers(duration_s: float, expected: int, send: Callable[[NodeTester, bytes], object]) -> Step:
+@parametrised
+def _answers(
+    t: NodeTester, duration_s: float, expected: int, send: Callable[[NodeTester, bytes], object]
+) -> None:
     """A request that ``send`` sends has this number of answers."""
-
-    def step(t: NodeTester) -> None:
-        answers = t.heard_after(0x580 + t.node_id, duration_s, lambda: send(t, upload_request(0x1000)))
-        t.equal(len(answers), expected, "number of answers")
-
-    return step
+    answers = t.heard_after(0x580 + t.node_id, duration_s, lambda: send(t, upload_request(0x1000)))
+    t.equal(len(answers), expected, "number of answers")
 
 
-def _repeats(count: int, act: Step = lambda _: None) -> Step:
-    """So many uploads of 1000h, each after ``act``, result in the same value."""
-
-    def step(t: NodeTester) -> None:
-        first = t.upload(0x1000)
-        for _ in range(count):
-            act(t)
-            t.equal(t.upload(0x1000), first, "1000h")
-
-    return step
+@parametrised
+def _repeats(t: NodeTester, count: int, act: Step = lambda _: None) -> None:
+    """Repeated uploads of 1000h, each after ``act``, return the same value."""
+    first = t.upload(0x1000)
+    for _ in range(count):
+        act(t)
+        t.equal(t.upload(0x1000), first, "1000h")
 
 
 def _is_usual(t: NodeTester) -> None:
@@ -118,7 +112,7 @@ def _is_usual(t: NodeTester) -> None:
 
 CHECKS.rows(
     _SDO,
-    *((f"sdo.upload.{size}", f"{index:04X}h is uploaded expedited, with its size of {size} bytes", index,
+    *((f"sdo.upload.{size}", f"{index:04X}h is uploaded expedited, with its size in bytes, {size}", index,
        _is_expedited(index, size)) for index, size in ((0x1000, 4), (0x1001, 1), (0x1017, 2))),
     ("sdo.answer.length", "An answer has eight bytes", lambda t: t.answer(upload_request(0x1000))),
     ("sdo.answer.once", "A request has one answer", _answers(0.05, 1, NodeTester.answer)),
@@ -150,7 +144,11 @@ def _(t: NodeTester) -> None:
         t.equal(_segment(t, 0x60 | toggle)[0] & 0x10, toggle, "toggle bit")
 
 
-@check("sdo.upload.segmented.last", "Only the last segment has the bit c, and n counts its free bytes", _SDO)
+@check(
+    "sdo.upload.segmented.last",
+    "Only the last segment has bit c set, and n is the number of its unused bytes",
+    _SDO,
+)
 def _(t: NodeTester) -> None:
     _, data = _open_upload(t)
     count = (len(data) + 6) // 7
@@ -181,17 +179,17 @@ def _abort_upload(t: NodeTester) -> None:
 
 CHECKS.rows(
     _SDO,
-    ("sdo.upload.toggle-error", "A wrong toggle bit of an upload is abort 05030000h", _open_upload,
+    ("sdo.upload.toggle-error", "A wrong toggle bit in an upload causes abort 05030000h", _open_upload,
      aborts(b"\x70" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")),
     ("sdo.upload.after-abort", "After an abort the transfer has ended", _open_upload,
      lambda t: _segment(t, 0x70), aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")),
-    ("sdo.upload.no-initiate", "An upload segment without initiation is abort 05040001h", _cancel,
+    ("sdo.upload.no-initiate", "An upload segment without initiation causes abort 05040001h", _cancel,
      aborts(b"\x60" + bytes(7), COMMAND, "segment without initiation")),
-    ("sdo.upload.client-abort", "An abort of the client has no answer and ends the transfer", _abort_upload,
+    ("sdo.upload.client-abort", "An abort by the client is not answered and ends the transfer", _abort_upload,
      aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")),
-    ("sdo.upload.restart", "A new request is served after a transfer that was not finished", _open_upload,
+    ("sdo.upload.restart", "A new request is served after an unfinished transfer", _open_upload,
      lambda t: _segment(t, 0x60), _is_served),
-    ("sdo.upload.abandoned", "A transfer that was abandoned a second ago blocks nothing", _open_upload,
+    ("sdo.upload.abandoned", "A transfer abandoned a second ago blocks nothing", _open_upload,
      waits(1.0), _is_served),
 )  # fmt: skip
 
@@ -219,25 +217,25 @@ def _too_short(t: NodeTester) -> bytes:
 
 CHECKS.rows(
     _SDO,
-    ("sdo.abort.no-object.upload", "Upload of a missing object is abort 06020000h",
+    ("sdo.abort.no-object.upload", "Upload of a missing object is refused with abort 06020000h",
      aborts(upload_request(_NOWHERE), ABSENT[:1])),
-    ("sdo.abort.no-object.download", "Download to a missing object is abort 06020000h",
+    ("sdo.abort.no-object.download", "Download to a missing object is refused with abort 06020000h",
      aborts(expedited(_NOWHERE, 0, b"\0"), ABSENT[:1])),
-    ("sdo.abort.no-sub.upload", "Upload of a missing sub-index is abort 06090011h",
+    ("sdo.abort.no-sub.upload", "Upload of a missing sub-index is refused with abort 06090011h",
      aborts(upload_request(0x1018, 200), ABSENT[1:])),
-    ("sdo.abort.no-sub.download", "Download to a missing sub-index is abort 06090011h",
+    ("sdo.abort.no-sub.download", "Download to a missing sub-index is refused with abort 06090011h",
      aborts(expedited(0x1018, 200, bytes(4)), ABSENT[1:])),
-    ("sdo.abort.read-only", "Download to a read-only object is abort 06010002h",
+    ("sdo.abort.read-only", "Download to a read-only object is refused with abort 06010002h",
      aborts(expedited(0x1000, 0, bytes(4)), READ_ONLY)),
-    ("sdo.abort.const", "Download to sub-index 0 of 1018h is abort 06010002h",
+    ("sdo.abort.const", "Download to sub-index 0 of 1018h is refused with abort 06010002h",
      aborts(expedited(0x1018, 0, b"\x04"), READ_ONLY)),
-    ("sdo.abort.write-only", "Upload of a write-only object is abort 06010001h",
-     lambda t: t.aborts(_write_only(t), WRITE_ONLY, "request")),
-    ("sdo.abort.too-long", "A download of too many bytes is abort 06070010h or 06070012h",
-     lambda t: t.aborts(_too_long(t), LENGTH, "request")),
-    ("sdo.abort.too-short", "A download of too few bytes is abort 06070010h or 06070013h",
-     lambda t: t.aborts(_too_short(t), LENGTH, "request")),
-    ("sdo.abort.command", "A command specifier that does not exist is abort 05040001h",
+    ("sdo.abort.write-only", "Upload of a write-only object is refused with abort 06010001h",
+     lambda t: t.aborts(_write_only(t), WRITE_ONLY)),
+    ("sdo.abort.too-long", "A download of too many bytes is refused with abort 06070010h or 06070012h",
+     lambda t: t.aborts(_too_long(t), LENGTH)),
+    ("sdo.abort.too-short", "A download of too few bytes is refused with abort 06070010h or 06070013h",
+     lambda t: t.aborts(_too_short(t), LENGTH)),
+    ("sdo.abort.command", "An unknown command specifier causes abort 05040001h",
      aborts(b"\xe0\0\x10\0" + bytes(4), COMMAND)),
     ("sdo.abort.long-segmented", "A segmented download of too many bytes is refused at its start",
      aborts(segmented(0x1017, 0, 9), LENGTH)),
@@ -249,7 +247,7 @@ CHECKS.rows(
 )  # fmt: skip
 
 
-@check("sdo.abort.value", "A value that was refused is not stored", _SDO)
+@check("sdo.abort.value", "A refused value is not stored", _SDO)
 def _(t: NodeTester) -> None:
     index, sub, size = _number(t)
     before = t.upload(index, sub)
@@ -260,23 +258,18 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- download
 
 
-def _downloads(request: Callable[[int, int, bytes], list[bytes]]) -> Step:
+@parametrised
+def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
     """The requests of ``request`` write a different value, which is read back; the old one is restored."""
-
-    def step(t: NodeTester) -> None:
-        index, sub, size = _number(t)
-        before = t.upload(index, sub)
-        value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
-        for place, each in enumerate(request(index, sub, value)):
-            answer = t.answer(each)
-            t.true(
-                answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out"
-            )
-        found = t.upload(index, sub)
-        t.download(index, sub, before)
-        t.equal(found, value, f"{index:04X}h")
-
-    return step
+    index, sub, size = _number(t)
+    before = t.upload(index, sub)
+    value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
+    for place, each in enumerate(request(index, sub, value)):
+        answer = t.answer(each)
+        t.true(answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out")
+    found = t.upload(index, sub)
+    t.download(index, sub, before)
+    t.equal(found, value, f"{index:04X}h")
 
 
 def _last_segment(data: bytes) -> bytes:
@@ -289,14 +282,14 @@ CHECKS.rows(
      _downloads(lambda index, sub, data: [expedited(index, sub, data)])),
     ("sdo.download.expedited.no-size", "An expedited download without a size is carried out",
      _downloads(lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")])),
-    ("sdo.download.segmented", "A number may come in a segment",
+    ("sdo.download.segmented", "A number may be sent in a segment",
      _downloads(lambda index, sub, data: [segmented(index, sub, len(data)), _last_segment(data)])),
     ("sdo.download.segmented.no-size", "A segmented download without a size is carried out",
      _downloads(lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _last_segment(data)])),
-    ("sdo.download.segmented.toggle-error", "A wrong toggle bit of a download is abort 05030000h",
+    ("sdo.download.segmented.toggle-error", "A wrong toggle bit in a download causes abort 05030000h",
      lambda t: t.answer(segmented(*_number(t))),
      aborts(b"\x1b" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")),
-    ("sdo.download.no-initiate", "A download segment without initiation is abort 05040001h", _cancel,
+    ("sdo.download.no-initiate", "A download segment without initiation causes abort 05040001h", _cancel,
      aborts(b"\x01" + bytes(7), COMMAND, "segment without initiation")),
 )  # fmt: skip
 
@@ -308,7 +301,9 @@ def _(t: NodeTester) -> None:
     t.equal(answer, b"\x60" + _mux(index, sub) + bytes(4), "response")
 
 
-@check("sdo.download.segmented.size", "Segments that do not have the announced size are refused", _SDO)
+@check(
+    "sdo.download.segmented.size", "Segments whose total differs from the announced size are refused", _SDO
+)
 def _(t: NodeTester) -> None:
     index, sub, size = _number(t)
     t.need(size >= 2, "the writable object has one byte")
@@ -319,7 +314,7 @@ def _(t: NodeTester) -> None:
     t.equal(t.upload(index, sub), before, f"{index:04X}h")
 
 
-@check("sdo.download.client-abort", "A download that the client aborts changes nothing", _SDO)
+@check("sdo.download.client-abort", "A download aborted by the client changes nothing", _SDO)
 def _(t: NodeTester) -> None:
     index, sub, size = _number(t)
     before = t.upload(index, sub)
@@ -384,7 +379,7 @@ def _whole_block(t: NodeTester) -> tuple[list[bytes], bytes]:
     return segments, end
 
 
-@check("sdo.block.upload", "A block upload carries the whole object", _SDO)
+@check("sdo.block.upload", "A block upload transfers the whole object", _SDO)
 def _(t: NodeTester) -> None:
     answer, data = _block_upload(t)
     if answer[0] & 2:
@@ -417,7 +412,7 @@ def _(t: NodeTester) -> None:
     t.equal(second[0][1 : 1 + len(data[7:14])], data[7:14], "data of the second block")
 
 
-@check("sdo.block.upload.repeat", "Segments that were not acknowledged are sent again", _SDO)
+@check("sdo.block.upload.repeat", "Unacknowledged segments are sent again", _SDO)
 def _(t: NodeTester) -> None:
     _, data = _block_upload(t)
     _segments(t)
@@ -430,14 +425,15 @@ def _(t: NodeTester) -> None:
 
 CHECKS.rows(
     _SDO,
-    *((f"sdo.block.upload.size-{size}", f"A block size of {size} is abort 05040002h", _block_upload, _cancel,
+    *((f"sdo.block.upload.size-{size}", f"A block size of {size} is refused with abort 05040002h",
+       _block_upload, _cancel,
        lambda t, size=size: t.aborts(_block_request(_text(t)[0], size), (0x05040002,), f"block size {size}"))
       for size in (0, 128)),
-    ("sdo.block.upload.sequence", "An acknowledgement of segments that were not sent is abort 05040003h",
+    ("sdo.block.upload.sequence", "Acknowledging segments that were not sent causes abort 05040003h",
      _block_upload, lambda t: t.aborts(
          bytes((0xA2, len(_segments(t)) + 1, 127)) + bytes(5), (0x05040003,), "acknowledgement")),
-    ("sdo.block.upload.missing", "Block upload of a missing object is abort 06020000h", _block_upload,
-     _cancel, aborts(_block_request(_NOWHERE), ABSENT[:1], "block upload")),
+    ("sdo.block.upload.missing", "Block upload of a missing object is refused with abort 06020000h",
+     _block_upload, _cancel, aborts(_block_request(_NOWHERE), ABSENT[:1], "block upload")),
 )  # fmt: skip
 
 
@@ -467,8 +463,9 @@ def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool =
     return t.answer(struct.pack("<BH5x", 0xC1 | (7 - size) << 2, (crc_hqx(data, 0) ^ spoil) if crc else 0))
 
 
-def _downloaded(*, crc: bool = True, skipped: bool = False) -> Step:
-    return lambda t: t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
+@parametrised
+def _downloaded(t: NodeTester, *, crc: bool = True, skipped: bool = False) -> None:
+    t.equal(_block_download(t, crc=crc, skipped=skipped)[0], 0xA1, "command of the end")
 
 
 def _crc_is_checked(t: NodeTester) -> None:
@@ -487,10 +484,10 @@ CHECKS.rows(
     ("sdo.block.download", "A block download is carried out", _downloaded()),
     ("sdo.block.download.no-crc", "A block download without a checksum is carried out",
      _downloaded(crc=False)),
-    ("sdo.block.download.crc", "A wrong checksum is abort 05040004h", _crc_is_checked),
-    ("sdo.block.download.sequence", "A segment out of order is not taken and may be sent again",
+    ("sdo.block.download.crc", "A wrong checksum causes abort 05040004h", _crc_is_checked),
+    ("sdo.block.download.sequence", "A segment out of order is not accepted and may be sent again",
      _downloaded(skipped=True)),
-    ("sdo.block.download.read-only", "Block download to a read-only object is abort 06010002h",
+    ("sdo.block.download.read-only", "Block download to a read-only object is refused with abort 06010002h",
      _end_block_download,
      aborts(b"\xc2" + _mux(0x1000, 0) + struct.pack("<I", 4), READ_ONLY, "block download")),
 )  # fmt: skip
@@ -502,6 +499,6 @@ CHECKS.add(
                                    [0x600 + t.node_id, 0x580 + t.node_id], "1200h"),
 )  # fmt: skip
 CHECKS.add(
-    "sdo.range", "A value outside the range of an object is abort 06090030h to 06090032h", _SDO, (0x1800, 2),
-    refuses(0x1800, 2, b"\xf5", RANGE),
+    "sdo.range", "A value outside an object's range is refused with abort 06090030h to 06090032h", _SDO,
+    (0x1800, 2), refuses(0x1800, 2, b"\xf5", RANGE),
 )  # fmt: skip

@@ -1,99 +1,69 @@
 """Steps of checks, for the tables.
 
-A function with parameters returns a step. Its docstring states what the step does, or requires of the node.
+A function decorated with `parametrised` returns a step. Its docstring states what the step requires of the
+node.
 """
 
 from collections.abc import Callable
+from typing import Concatenate, ParamSpec
 
 from hdbridge.cia301 import NmtCommand
 from hdbridge.conformance.tester import NodeTester, Step
-from hdbridge.drive.states import State
+
+_Arguments = ParamSpec("_Arguments")
 
 
-def reset_node(t: NodeTester) -> None:
-    """Resets the node."""
-    t.reset(NmtCommand.RESET_NODE)
+def parametrised(
+    function: Callable[Concatenate[NodeTester, _Arguments], object],
+) -> Callable[_Arguments, Step]:
+    """Returns a function that binds all arguments but the tester; its result is a step."""
+
+    def bound(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Step:
+        return lambda t: function(t, *args, **kwargs)
+
+    return bound
 
 
-def sends_nmt(command: NmtCommand) -> Step:
-    """Sends an NMT command."""
-    return lambda t: t.nmt(command)
+aborts = parametrised(NodeTester.aborts)
+control = parametrised(NodeTester.control)
+puts = parametrised(NodeTester.put)
+reaches = parametrised(NodeTester.reaches)
+refuses = parametrised(NodeTester.refuses_value)
+sends_nmt = parametrised(NodeTester.nmt)
+stays = parametrised(NodeTester.stays)
+waits = parametrised(NodeTester.wait)
+writes = parametrised(NodeTester.write)
+reset_node = parametrised(NodeTester.reset)(NmtCommand.RESET_NODE)
 
 
-def aborts(request: bytes, codes: tuple[int, ...], what: str = "request") -> Step:
-    """An SDO request is refused with one of the abort codes."""
-    return lambda t: t.aborts(request, codes, what)
-
-
-def refuses(index: int, sub: int, data: bytes, codes: tuple[int, ...]) -> Step:
-    """A value is refused with one of the abort codes, and not stored."""
-    return lambda t: t.refuses_value(index, sub, data, codes)
-
-
-def holds(index: int, sub: int, expected: int, digits: int = 0) -> Step:
+@parametrised
+def holds(t: NodeTester, index: int, sub: int, expected: int, digits: int = 0) -> None:
     """An object has this value. Only the last ``digits`` hexadecimal digits are compared; 0 compares all."""
-
-    def step(t: NodeTester) -> None:
-        found = t.read(index, sub)
-        if digits:
-            found_h, expected_h = (
-                f"{each & (1 << 4 * digits) - 1:0{digits}X}h" for each in (found, expected)
-            )
-            t.equal(found_h, expected_h, _name(index, sub))
-        else:
-            t.equal(found, expected, _name(index, sub))
-
-    return step
+    found = t.read(index, sub)
+    if digits:
+        found_h, expected_h = (f"{each & (1 << 4 * digits) - 1:0{digits}X}h" for each in (found, expected))
+        t.equal(found_h, expected_h, _name(index, sub))
+    else:
+        t.equal(found, expected, _name(index, sub))
 
 
-def reads(index: int, sub: int, right: Callable[[int], object], expected: str) -> Step:
+@parametrised
+def reads(t: NodeTester, index: int, sub: int, right: Callable[[int], object], expected: str) -> None:
     """The value of an object is right; ``expected`` describes the right values."""
-
-    def step(t: NodeTester) -> None:
-        found = t.read(index, sub)
-        t.true(right(found), f"{_name(index, sub)} = {found}", expected)
-
-    return step
+    found = t.read(index, sub)
+    t.true(right(found), f"{_name(index, sub)} = {found}", expected)
 
 
-def has_bits(index: int, mask: int, expected: int, what: str) -> Step:
+@parametrised
+def has_bits(t: NodeTester, index: int, mask: int, expected: int, what: str) -> None:
     """An object has these values of the bits in a mask."""
-    return lambda t: t.equal(t.read(index) & mask, expected, what)
+    t.equal(t.read(index) & mask, expected, what)
 
 
-def writes(index: int, sub: int, value: int, size: int) -> Step:
-    """The node accepts a value, which is replaced by the previous one at the end of the check."""
-    return lambda t: t.write(index, sub, value, size)
-
-
-def puts(index: int, sub: int, value: int, size: int) -> Step:
-    """The node accepts a value, which it keeps."""
-    return lambda t: t.put(index, sub, value, size)
-
-
-def no_emergency(duration_s: float, act: Step = lambda _: None) -> Step:
+@parametrised
+def no_emergency(t: NodeTester, duration_s: float, act: Step = lambda _: None) -> None:
     """The node sends no EMCY message during ``act`` and for a duration after it."""
-    return lambda t: t.equal(t.emergencies_after(duration_s, lambda: act(t)), [], "EMCY codes")
-
-
-def control(word: int) -> Step:
-    """Writes the controlword."""
-    return lambda t: t.control(word)
-
-
-def reaches(*states: State) -> Step:
-    """The drive reaches one of these power states."""
-    return lambda t: t.reaches(*states)
-
-
-def stays(state: State, duration_s: float = 0.05) -> Step:
-    """The drive is in a power state throughout a duration."""
-    return lambda t: t.stays(state, duration_s)
-
-
-def waits(duration_s: float) -> Step:
-    """Waits."""
-    return lambda t: t.wait(duration_s)
+    t.equal(t.emergencies_after(duration_s, lambda: act(t)), [], "EMCY codes")
 
 
 def _name(index: int, sub: int) -> str:

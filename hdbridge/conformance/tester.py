@@ -414,7 +414,7 @@ class NodeTester:
         self.equal(len(answer), 8, "length of the SDO answer")
         return answer
 
-    def aborts(self, request: bytes, codes: tuple[int, ...], what: str) -> None:
+    def aborts(self, request: bytes, codes: tuple[int, ...], what: str = "request") -> None:
         """Fails unless the request is refused with one of the abort codes."""
         answer = self.answer(request)
         expected = abort_codes(codes)
@@ -704,9 +704,9 @@ def expedited(index: int, sub: int, data: bytes) -> bytes:
     return struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
 
 
-def abort(index: int = 0, sub: int = 0, code: int = 0x08000000) -> bytes:
+def abort(index: int = 0, sub: int = 0) -> bytes:
     """Returns the abort message of a client."""
-    return struct.pack("<BHBI", 0x80, index, sub, code)
+    return struct.pack("<BHBI", 0x80, index, sub, 0x08000000)
 
 
 def upload_request(index: int, sub: int = 0) -> bytes:

@@ -57,7 +57,7 @@ class AdaptationSettings(Strict):
     mode: AdaptationMode = Field(AdaptationMode.OFF, description="observe only reports what would change")
     parameters: tuple[Parameter, ...] | None = Field(
         None,
-        description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
+        description="adapted parameters, as EFFECT.PARAMETER; by default all changed by wear or temperature",
     )
     rate_arcsec_per_hour: float = Field(
         30.0, gt=0, le=36_000, description="fastest change of any coefficient of the model"
@@ -69,7 +69,7 @@ class AdaptationSettings(Strict):
         0.5, gt=0, le=1, description="largest deviation of a coefficient, as a fraction of the committed one"
     )
     least_bound_arcsec: float = Field(
-        5.0, ge=0, le=3600, description="largest deviation, if that share is smaller"
+        5.0, ge=0, le=3600, description="largest deviation, if bound_share permits less"
     )
     zero_bound_arcsec: float = Field(60.0, gt=0, le=3600, description="largest plausible change of the zero")
     half_life_turns: float = Field(
@@ -145,7 +145,7 @@ class GatewaySettings(Strict):
 
     bus: BusConfig = Field(description="the bus of the other master")
     nodes: dict[str, Annotated[int, Field(ge=1, le=127)]] = Field(
-        min_length=1, description="node id on that bus of each axis, by its name"
+        min_length=1, description="node id of each axis on the other master's bus, by axis name"
     )
     counts_per_turn: int = Field(
         12_960_000, ge=3600, le=1 << 28, description="increments per load turn (default 0.1 arcsec each)"
@@ -155,7 +155,7 @@ class GatewaySettings(Strict):
         ge=10,
         le=10_000,
         description="time without set-points after which an axis at rest loses power; in motion it keeps its "
-        "speed for a fifth of it, then brakes",
+        "speed for a fifth of this time, then brakes",
     )
 
 

@@ -19,8 +19,8 @@ from hdbridge.axis.effects import CATALOGUE
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.fleet.dataset import write_table
-from hdbridge.fleet.statistics import OUTLIERS_FROM, normal_range, prevalence, repeats
-from hdbridge.fleet.summary import REPEATED, Row, named_by, own_recordings
+from hdbridge.fleet.statistics import OUTLIERS_FROM, normal_range, prevalence
+from hdbridge.fleet.summary import Row, grouped, named_by, occurrence, own_recordings
 
 SCHEMA: Final = "hdbridge.fleet-prior/1"
 GROUPS: Final = ("gear", "batch", "cell", "lubricant")
@@ -34,23 +34,14 @@ def prior_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     joints = own_recordings(rows)[0]
     result: list[dict[str, Any]] = []
     for cause in CATALOGUE:
-        named = {name: [named_by(row, cause) is not None for row in own] for name, own in joints.items()}
-        found = repeats([*named.values()])
-        sick = {
-            name
-            for (name, each), share in zip(named.items(), found.probability.tolist(), strict=True)
-            if share > 0.5 and sum(each) >= REPEATED
-        }
+        found, sick = occurrence(joints, cause)
         common = {"cause": cause, "named": found.named, "wrongly": found.wrongly}
         every = {"joints": len(joints), "cases": len(sick), "share": found.share}
         ranges = _ranges(cause, {name: joints[name] for name in sick})
         result.append({**common, **every, "attribute": None, "group": None, "parameters": ranges})
         for attribute in GROUPS:
-            groups: dict[str, list[str]] = defaultdict(list)
-            for name, own in joints.items():
-                if own[-1][attribute] is not None:
-                    groups[own[-1][attribute]].append(name)
-            cases = {group: (len(sick.intersection(own)), len(own)) for group, own in sorted(groups.items())}
+            groups = grouped(joints, attribute)
+            cases = {group: (len(sick.intersection(own)), len(own)) for group, own in groups.items()}
             pooled = prevalence({"all": (len(sick), len(joints))})["all"].value if cases else 0.0
             for group, share in prevalence(cases).items():
                 # The overall prevalence comes from all recordings; the group shifts its odds.

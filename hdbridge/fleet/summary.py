@@ -16,8 +16,8 @@ import numpy as np
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.fleet.statistics import (
     Interval,
+    Repeats,
     Series,
-    Trend,
     identities,
     normal_range,
     outliers,
@@ -142,9 +142,9 @@ _KINDS: Final = {
 def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
     """Summarises the recordings of a data set (`Dataset.recordings`)."""
     joints, mistaken = own_recordings(rows)
-    has, rates, sizes = _causes(joints)
-    changed = _figures(joints)
-    first = _first(joints, has, sizes, changed, limit_arcsec)
+    causes = sorted({each["cause"] for own in joints.values() for row in own for each in row["findings"]})
+    found = {cause: occurrence(joints, cause) for cause in causes}
+    first = _first(joints, found, _figures(joints), limit_arcsec)
     explained = {each.joint for each in first}
     mistaken = tuple(each for each in mistaken if each.kind != "changed" or each.joint not in explained)
     return Summary(
@@ -152,8 +152,8 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
         joints=len({row["joint"] for row in rows if row["joint"]}),
         limit_arcsec=limit_arcsec,
         first=first,
-        prevalence=_prevalence(joints, has),
-        rates=rates,
+        prevalence=_prevalence(joints, found),
+        rates={cause: (each.share, each.named, each.wrongly) for cause, (each, _) in found.items()},
         odd=_odd(joints),
         mistaken=mistaken,
         duplicates=tuple(
@@ -212,23 +212,21 @@ def _mistaken(good: Sequence[Row]) -> tuple[tuple[MismatchedRecording, ...], set
     return tuple(result), foreign
 
 
-def _causes(
-    joints: Mapping[str, Sequence[Row]],
-) -> tuple[
-    dict[str, dict[str, float]], dict[str, tuple[float, float, float]], dict[str, dict[str, Trend | None]]
-]:
-    """Returns, by cause, the probability that each joint has it, the fleet's rates, and the peak's trends."""
-    causes = sorted({each["cause"] for rows in joints.values() for row in rows for each in row["findings"]})
-    names = list(joints)
-    has: dict[str, dict[str, float]] = {}
-    rates: dict[str, tuple[float, float, float]] = {}
-    sizes: dict[str, dict[str, Trend | None]] = {}
-    for cause in causes:
-        found = repeats([[_peak(row, cause) is not None for row in joints[name]] for name in names])
-        has[cause] = dict(zip(names, found.probability.tolist(), strict=True))
-        rates[cause] = (found.share, found.named, found.wrongly)
-        sizes[cause] = dict(zip(names, trends([_size(joints[name], cause) for name in names]), strict=True))
-    return has, rates, sizes
+def occurrence(joints: Mapping[str, Sequence[Row]], cause: str) -> tuple[Repeats, set[str]]:
+    """Returns the estimated rates of a cause, and the joints that have it."""
+    named = [[named_by(row, cause) is not None for row in rows] for rows in joints.values()]
+    found = repeats(named)
+    probable = zip(joints, named, found.probability.tolist(), strict=True)
+    return found, {joint for joint, own, share in probable if share > 0.5 and sum(own) >= REPEATED}
+
+
+def grouped(joints: Mapping[str, Sequence[Row]], attribute: str) -> dict[str, list[str]]:
+    """Returns the joints by their group of an attribute, in order of the groups' names."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for joint, rows in joints.items():
+        if rows[-1][attribute] is not None:
+            groups[rows[-1][attribute]].append(joint)
+    return dict(sorted(groups.items()))
 
 
 def named_by(row: Row, cause: str) -> Mapping[str, Any] | None:
@@ -293,21 +291,20 @@ def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float,
 
 def _first(
     joints: Mapping[str, Sequence[Row]],
-    has: Mapping[str, Mapping[str, float]],
-    sizes: Mapping[str, Mapping[str, Trend | None]],
+    occurrences: Mapping[str, tuple[Repeats, set[str]]],
     changed: Mapping[str, Sequence[tuple[float, str]]],
     limit_arcsec: float,
 ) -> tuple[Candidate, ...]:
     claims: list[Candidate] = []
-    for cause, of_joint in has.items():
-        common = _common(joints, of_joint)
-        for name, probability in of_joint.items():
-            rows = joints[name]
+    for cause, (found, _) in occurrences.items():
+        probabilities = found.probability.tolist()
+        common = _common(joints, probabilities)
+        of_joint = trends([_size(rows, cause) for rows in joints.values()])
+        for (name, rows), probability, trend in zip(joints.items(), probabilities, of_joint, strict=True):
             named = [row for row in rows if _peak(row, cause) is not None]
             recent = any(_peak(row, cause) is not None for row in rows[-2:])
             if len(named) < REPEATED or not recent:
                 continue
-            trend = sizes[cause][name]
             growing = trend is not None and trend.growing() >= SURE and trend.changing >= SURE
             last = next(each for each in named[-1]["findings"] if each["cause"] == cause)
             # A cause of this size would have been found in the first recording.
@@ -342,10 +339,10 @@ def _first(
     return tuple(sorted(chosen.values(), key=_urgency))
 
 
-def _common(joints: Mapping[str, Sequence[Row]], of_joint: Mapping[str, float]) -> dict[str, bool]:
+def _common(joints: Mapping[str, Sequence[Row]], probabilities: Sequence[float]) -> dict[str, bool]:
     shares: dict[str, list[float]] = defaultdict(list)
-    for name, probability in of_joint.items():
-        shares[joints[name][-1]["gear"]].append(probability)
+    for rows, probability in zip(joints.values(), probabilities, strict=True):
+        shares[rows[-1]["gear"]].append(probability)
     return {gear: float(np.mean(each)) > COMMON for gear, each in shares.items()}
 
 
@@ -358,34 +355,19 @@ def _urgency(each: Candidate) -> tuple[float, float, str]:
 
 
 def _prevalence(
-    joints: Mapping[str, Sequence[Row]], has: Mapping[str, Mapping[str, float]]
+    joints: Mapping[str, Sequence[Row]], occurrences: Mapping[str, tuple[Repeats, set[str]]]
 ) -> dict[str, dict[str, dict[str, tuple[int, int, Interval]]]]:
     result: dict[str, dict[str, dict[str, tuple[int, int, Interval]]]] = {}
     for attribute in ATTRIBUTES:
-        groups = {
-            name: rows[-1][attribute] for name, rows in joints.items() if rows[-1][attribute] is not None
-        }
-        if len(set(groups.values())) < 2:
+        groups = grouped(joints, attribute)
+        if len(groups) < 2:
             continue
         result[attribute] = {}
-        for cause, of_joint in has.items():
-            sick = {
-                name
-                for name in groups
-                if of_joint[name] > 0.5
-                and sum(_peak(row, cause) is not None for row in joints[name]) >= REPEATED
-            }
-            if not sick:
-                continue
-            cases = {
-                group: (
-                    sum(name in sick for name, each in groups.items() if each == group),
-                    sum(each == group for each in groups.values()),
-                )
-                for group in sorted(set(groups.values()))
-            }
-            shares = prevalence(cases)
-            result[attribute][cause] = {group: (*cases[group], shares[group]) for group in cases}
+        for cause, (_, sick) in occurrences.items():
+            cases = {group: (len(sick.intersection(own)), len(own)) for group, own in groups.items()}
+            if any(count for count, _ in cases.values()):
+                shares = prevalence(cases)
+                result[attribute][cause] = {group: (*cases[group], shares[group]) for group in cases}
     return result
 
 

@@ -276,7 +276,7 @@ class Origin:
         lost = ahead - steps[steps < 0.0]
         for period in _CLOCK_PERIODS:
             if np.all(np.abs(lost - period) < 2.0 * ahead) and ahead < 0.1 * period:
-                return f"for a clock that wraps pass {option('--unwrap', {'time': f'{period:.12g}'})}"
+                return f"for a clock that wraps, pass {option('--unwrap', {'time': f'{period:.12g}'})}"
         return ""
 
     def exchanged(self) -> str:

@@ -52,7 +52,7 @@ def _stepping_text(checked: Validation) -> str:
     return (
         f"The axis stepped both ways, before and after. This axis's counts and noise allow {SIGMA} = "
         f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is {share:.2f} times "
-        f"that.{''.join(f' It got {each}.' for each in checked.worse)}"
+        f"that.{''.join(f' It became {each}.' for each in checked.worse)}"
         f"{''.join(f' Noted: {each}.' for each in checked.fault_notes)}"
     )
 

@@ -107,7 +107,7 @@ WRONG: list[tuple[str, dict[str, Any], str, str]] = [
         "the other output of the gear",
         {"truth": {"gear:\n  ratio: 50": "gear:\n  ratio: 51"}},
         "turn",
-        "axis.yaml:37:3: gear.ratio: found 50, expected 51 (the output is the other one",
+        "axis.yaml:37:3: gear.ratio: found 50, expected 51 (the output is the other part",
     ),
     (
         "another gear, and the drive says so",

@@ -118,5 +118,5 @@ def test_worsening_in_one_direction_is_reported():
     assert trial.worse == checked.worse
     assert checked.as_dict()["worse"] == list(checked.worse)
     (section, *_) = stepping_sections(checked)
-    assert "It got worse CCW" in section.text
+    assert "It became worse CCW" in section.text
     assert Validation(after, before, Floor(1.0, 0.5)).worse == ()

@@ -18,6 +18,7 @@ from hdbridge.axis.effects.described import (
     Part,
     Shape,
     Sought,
+    Sum,
     Tracker,
 )
 from hdbridge.axis.effects.direction_phase import DirectionPhase
@@ -103,7 +104,7 @@ __all__ = [
     "HysteresisParameters", "InertialWindup", "IntArray", "LoadOrders", "LocalDefect", "Loop", "Moment",
     "Motion", "MotorEncoderEccentricity", "MotorOrder", "MotorOrders", "Moves", "Observations",
     "Observer", "Part", "RateDependence", "RatioError", "Relaxation", "Shape", "Sought", "Start",
-    "Step", "SubdivisionalError", "Synchronous", "TorqueGrowth", "TorqueModulation", "Tracker",
+    "Step", "SubdivisionalError", "Sum", "Synchronous", "TorqueGrowth", "TorqueModulation", "Tracker",
     "VelocityWindup", "Vibration", "Wear", "ZeroDrift", "aliases_of", "causes", "compensable",
     "conflicts", "extended", "fall_bound", "in_place", "is_ripple", "missing_channels", "moments",
     "readings", "refreshed", "register", "ripple", "withdraw",

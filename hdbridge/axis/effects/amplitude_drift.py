@@ -118,7 +118,7 @@ class AmplitudeDrift(Modulating, Warmed):
     about = Cause(
         title="ripple and friction change with temperature",
         subject="drift",
-        equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
+        equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau if they grow with "
         "torque), H its loop, w the gear's warmth as in zero_drift",
         signature="the ripple within a motor turn, or the height of the loop, follows the temperature",
         consequence="a compensation calibrated warm is wrong in the cold",

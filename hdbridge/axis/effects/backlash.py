@@ -42,7 +42,7 @@ class Backlash(Linear):
                 3, "repeat the small reversals with a load torque to one side: it holds a gap closed"
             ),
             "hysteresis_memory": Experiment(
-                3, "reversals of 0.1 to 2 deg of the motor, each beyond where the last one turned"
+                3, "reversals of 0.1 to 2 deg of the motor, each beyond the last turning point"
             ),
         },
     )

@@ -24,7 +24,7 @@ class Loop(Strict):
     """Copy of the elastic loop that an effect modulates: the parameters of its law."""
 
     offset_arcsec: float = Field(
-        ge=-3600, le=3600, description="half the height, at the load; negative where it lags"
+        ge=-3600, le=3600, description="half the height, at the load; negative if the load lags"
     )
     width_deg: float = Field(gt=0, le=3600, description="motor angle of a full crossing")
     exponent: float = Field(gt=1, le=6, description="shape n of the branch")

@@ -67,7 +67,7 @@ class Compliance(Angleless, Linear):
     torque1_nm: float = Field(gt=0, le=1e5, description="T1")
     torque2_nm: float = Field(gt=0, le=1e5, description="T2, above T1")
     sense: Literal[1, -1] = Field(
-        1, description="1: a positive torque pushes the load forward; -1: it is what the gear delivers"
+        1, description="1: a positive torque pushes the load forward; -1: the gear delivers it"
     )
     torque: TorqueChannel = "load_torque_nm"
     limit_nm: TorqueLimit = 1000.0

@@ -75,7 +75,7 @@ class CountLoss(Angleless):
 
     def unidentifiable(self, observations: Observations) -> str:
         """Requires reversals, because without them a step in time may also be a step in position."""
-        return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
+        return "" if observations.reversals >= 2 else "a step in time could also be a step at one angle"
 
     def shows(self, motion: Motion) -> Stretch | None:
         """Returns the samples away from reversals, where a misfit of the loop's shape leaves no steps."""

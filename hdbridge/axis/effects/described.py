@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple, Protocol
@@ -211,3 +211,27 @@ class Scaled(Tracker):
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
         return self._factor(moment) * self._tracker.advance(motor_deg, moment)
+
+
+class Sum(Tracker):
+    """Tracker of the sum of several trackers' errors."""
+
+    def __init__(self, trackers: Sequence[Tracker]) -> None:
+        self._trackers = trackers
+
+    @property
+    def memory_deg(self) -> float:
+        """Longest memory of all trackers."""
+        return max((each.memory_deg for each in self._trackers), default=0.0)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        total = 0.0
+        for tracker in self._trackers:
+            total += tracker.peek(motor_deg, moment)
+        return total
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        total = 0.0
+        for tracker in self._trackers:
+            total += tracker.advance(motor_deg, moment)
+        return total

@@ -9,9 +9,9 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop, loop_of
-from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Tracker
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Sum, Tracker
 from hdbridge.axis.effects.hysteresis import Hysteresis
-from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
+from hdbridge.axis.effects.motion import FloatArray, Motion, Start
 
 
 class HysteresisParameters(Effect):
@@ -75,7 +75,8 @@ class HysteresisParameters(Effect):
         return self.changed().law().predict(motion, start) - self.base.law().predict(motion, start)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self.changed().law().tracker(start), self.base.law().tracker(start))
+        negative = self.base.model_copy(update={"offset_arcsec": -self.base.offset_arcsec})
+        return Sum([each.law().tracker(start) for each in (self.changed(), negative)])
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the new and the old loop for an offset of 1 arcsec, shape (n, 2)."""
@@ -108,20 +109,3 @@ class HysteresisParameters(Effect):
         loop = loop_of(base)
         changed = {**loop.model_dump(exclude={"memory"}), "offset_arcsec": 1.2 * loop.offset_arcsec}
         return {"base": loop, **changed}
-
-
-class _Tracker(Tracker):
-    def __init__(self, new: Tracker, old: Tracker) -> None:
-        self._new = new
-        self._old = old
-
-    @property
-    def memory_deg(self) -> float:
-        """The longer memory of the two loops."""
-        return max(self._new.memory_deg, self._old.memory_deg)
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._new.peek(motor_deg, moment) - self._old.peek(motor_deg, moment)
-
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        return self._new.advance(motor_deg, moment) - self._old.advance(motor_deg, moment)

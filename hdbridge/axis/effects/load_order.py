@@ -34,8 +34,8 @@ class LoadOrders(OrderSeries):
         apart={
             "compliance": Experiment(
                 5,
-                "take the mass off or turn it by 90 deg, sweep one load turn both ways: a wind-up goes "
-                "with it",
+                "take the mass off or turn it by 90 deg, sweep one load turn both ways: a wind-up "
+                "changes with it",
             ),
             "ratio_error": Experiment(
                 6, "sweep two whole load turns both ways: a ramp continues, a load order repeats"

@@ -38,7 +38,7 @@ class LocalDefect(Momentary, Linear):
         signature="the same bump on every pass over one load angle, in both directions",
         consequence="the load is off at one place, and the tooth wears further",
         remedy="inspect the tooth, and clean the load encoder's disc, on which a mark looks the same; "
-        "compensate it meanwhile",
+        "compensate it until then",
         experiment="several slow passes over the place, both ways, and again with the load encoder "
         "re-clocked",
         aliases=("load_order",),
@@ -74,7 +74,7 @@ class LocalDefect(Momentary, Linear):
 
     def unidentifiable(self, observations: Observations) -> str:
         """Requires different passes, because identical ones do not separate a position from a time."""
-        return "" if self._is_met(observations) else "not passed often enough, or always alike"
+        return "" if self._is_met(observations) else "not passed often enough, or always in the same way"
 
     def _is_met(self, observations: Observations) -> bool:
         """Returns True if the axis passed the bump repeatedly, in both directions or at different speeds."""

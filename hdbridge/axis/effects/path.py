@@ -117,7 +117,7 @@ def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
 def away_from_reversals(motion: Motion) -> Stretch:
     """Returns the samples so far from a reversal that an elastic loop of any shape is saturated."""
     rows = since_reversal_deg(motion.motor_deg) > LOOP_DEG
-    return Stretch(rows, "seen only where the axis reverses")
+    return Stretch(rows, "seen only at reversals of the axis")
 
 
 def standing_s(motion: Motion) -> FloatArray:

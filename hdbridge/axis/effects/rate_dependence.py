@@ -40,7 +40,7 @@ class RateDependence(Modulating):
 
     loop: Loop = Field(description="the model's loop")
     growth_percent: float = Field(ge=0, le=200, description="growth per decade of speed")
-    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed from which on it grows")
+    reference_deg_s: float = Field(gt=0, le=1e5, description="motor speed above which it grows")
     limit_deg_s: float = Field(
         20_000.0, gt=0, le=1e6, description="motor speed above which the effect is constant"
     )

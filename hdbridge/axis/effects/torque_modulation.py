@@ -31,7 +31,7 @@ class TorqueModulation(TorqueGrowth, Modulating):
     about = Cause(
         title="ripple that grows with load",
         subject="effects of torque",
-        equation="growth tau S(theta_M), S the carried orders, tau = |T| (or T where signed), limited to "
+        equation="growth tau S(theta_M), S the carried orders, tau = |T| (or T if signed), limited to "
         "T_limit",
         signature="the amplitude of the ripple within a motor turn follows the load torque",
         consequence="the synchronous compensation is too small under load",

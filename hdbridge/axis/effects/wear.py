@@ -31,7 +31,7 @@ class Wear(Linear):
         "s = clip(s_before + 2 d theta_M / width, -1, 1)",
         signature="the distance between the two directions grows steadily with the turns run, at one "
         "temperature",
-        consequence="repeatability from either side gets worse with time",
+        consequence="repeatability from either side worsens with time",
         remedy="calibrate at intervals; watch the rate; grease; replace the gear when the rate rises",
         experiment="the same stepping test, cold, some hours of running apart",
         aliases=("amplitude_drift", "zero_drift", "ratio_error", "backlash"),

@@ -24,7 +24,8 @@ class ZeroDrift(Linear, Warmed):
         equation="drift w, w = u - reference, tau du/dt = temperature - u "
         "(or w = warm_up (1 - exp(-t / tau)))",
         signature="a slow shift, the same in both directions, with a time constant of minutes to an hour",
-        consequence="all positions are off alike until the axis is as warm as in its calibration",
+        consequence="all positions are off by the same amount until the axis is as warm as "
+        "in its calibration",
         remedy="warm up before work; home warm; a temperature sensor at the gear makes it predictable",
         experiment="return to a reference pose repeatedly while the axis warms and cools; record the "
         "temperature",
@@ -42,8 +43,8 @@ class ZeroDrift(Linear, Warmed):
             ),
             "ratio_error": Experiment(
                 3,
-                "sweep a load turn forth and back at twice the speed: a ramp goes with the angle, a drift "
-                "with time",
+                "sweep a load turn forth and back at twice the speed: a ramp depends on the angle, a "
+                "drift on time",
             ),
         },
     )

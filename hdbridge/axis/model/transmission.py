@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Moment, Motion, Start, Tracker
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Motion, Start, Sum, Tracker
 from hdbridge.axis.model.binding import binding, check_binding
 from hdbridge.axis.model.file import ModelFile, effects_of, text_of
 from hdbridge.axis.model.response import Response
@@ -47,9 +47,9 @@ class TransmissionModel:
             total += effect.predict(motion, start)
         return total
 
-    def tracker(self, start: Start = Start.VIRGIN) -> ModelTracker:
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """Returns a new on-line tracker of the sum of all effects."""
-        return ModelTracker([effect.tracker(start) for effect in self.effects])
+        return Sum([effect.tracker(start) for effect in self.effects])
 
     def only(self, names: Iterable[str]) -> Self:
         """Returns the model with only the named effects; unknown names are ignored.
@@ -148,29 +148,3 @@ class TransmissionModel:
 
     def _name(self) -> str:
         return str(self.path) if self.path else "this model"
-
-
-class ModelTracker(Tracker):
-    """Tracker of the sum of all effects."""
-
-    def __init__(self, trackers: list[Tracker]) -> None:
-        self._trackers = trackers
-
-    @property
-    def memory_deg(self) -> float:
-        """Longest memory of all effects."""
-        return max((each.memory_deg for each in self._trackers), default=0.0)
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the sum of the effects at ``motor_deg``, arcsec, without changing any state."""
-        total = 0.0
-        for tracker in self._trackers:
-            total += tracker.peek(motor_deg, moment)
-        return total
-
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Advances all effects to ``motor_deg`` and returns their sum, arcsec."""
-        total = 0.0
-        for tracker in self._trackers:
-            total += tracker.advance(motor_deg, moment)
-        return total

@@ -171,7 +171,9 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> SuspectEntry:
         other = found + (1.0 if teeth.output == "flexspline" else -1.0)
         if abs(other / wanted - 1.0) <= tolerance:
             held = "circular_spline" if teeth.output == "flexspline" else "flexspline"
-            return SuspectEntry(RATIO, found, other, 4.0, f"the output is the other one: teeth.output {held}")
+            return SuspectEntry(
+                RATIO, found, other, 4.0, f"the output is the other part: teeth.output {held}"
+            )
     whole = round(wanted)
     if whole >= 1 and abs(whole / wanted - 1.0) <= tolerance:
         # Numbers of teeth that give the ratio of the axis file are evidence for that ratio.

@@ -243,15 +243,10 @@ def _fetched(sdo: SdoClient, addresses: Iterable[Address]) -> dict[Address, int]
     return found
 
 
-def identity_matches(axis: AxisConfig, node: Node) -> bool:
-    """Returns True if the node's identity is that of the axis file."""
-    return not _identity_lines(axis, node)
-
-
 def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
     """Returns True if the axis file's drive was found, else False and one line for each necessary change."""
     there = scan.node(axis.drive.node_id)
-    if there is not None and there.answers and there.usable and identity_matches(axis, there):
+    if there is not None and there.answers and there.usable and not _identity_lines(axis, there):
         return True, []
     lines = []
     if there is None:
@@ -271,7 +266,7 @@ def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
     else:
         lines += _identity_lines(axis, there)
     for node in scan.nodes:
-        if node is not there and node.usable and identity_matches(axis, node):
+        if node is not there and node.usable and not _identity_lines(axis, node):
             lines.append(
                 f"{axis.where('drive.node_id')}: found {axis.drive.node_id}; the drive with this identity "
                 f"is node {node.node_id}"
@@ -296,7 +291,7 @@ def axis_lines(node: Node) -> list[str]:
 
 
 def axis_sections(node: Node) -> dict[str, list[str]]:
-    """Returns the lines for an axis file by section: the node's data; none for a node that is of no use."""
+    """Returns the lines of an axis file that state a node's data, by section; none for an unusable node."""
     if node.profile == 406:
         units = node.values.get(ENCODER_UNITS_PER_TURN)
         return {

@@ -37,7 +37,7 @@ _MACHINE: Final[dict[str, tuple[str, tuple[dict[str, Any], ...]]]] = {
         tuple(_sweep(each, motor_turns=3) for each in (0.1, 0.4, 1.6)),
     ),
     "growing-reversals": (
-        "reversals of 0.1 to 24 deg of the motor, each beyond where the last one turned",
+        "reversals of 0.1 to 24 deg of the motor, each beyond the last turning point",
         (
             {
                 "procedure": "reversals",

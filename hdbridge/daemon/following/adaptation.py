@@ -1,10 +1,10 @@
 """Adaptation of one axis: observations update an estimate, and the model in use follows it within bounds.
 
 A window of observations is complete once the axis has moved enough (`Excitation`). It is rejected as a whole
-if neither wear nor temperature can explain it, because both are slow and act alike at all angles. Learning is
-then frozen until the cause ends, and the updates by the last windows before the fault are reverted. `health`
-and `zero` judge the load encoder; the tests here are those that need the estimate. There is no I/O and no
-clock, because observations contain the time.
+if neither wear nor temperature can explain it, because both are slow and act equally at all angles. Learning
+is then frozen until the cause ends, and the updates by the last windows before the fault are reverted.
+`health` and `zero` judge the load encoder; the tests here are those that need the estimate. There is no I/O
+and no clock, because observations contain the time.
 """
 
 import math
@@ -450,7 +450,7 @@ def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:
 def _outlier_freeze(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
     """Returns a freeze if residuals exceed the gate for wear and temperature, both (n,).
 
-    It is lasting if all residuals are shifted alike.
+    It is lasting if all residuals are shifted equally.
     """
     if np.all(np.abs(residual_arcsec) <= gate_arcsec):
         return None

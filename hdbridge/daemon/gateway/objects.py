@@ -71,7 +71,7 @@ def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
     encoder.
     """
     return Nameplate(
-        serial=settings.nodes[axis.name],  # LSS selects an axis by it
+        serial=settings.nodes[axis.name],  # by which LSS selects the axis
         motor_counts_per_turn=settings.counts_per_turn,
         load_counts_per_turn=round(axis.motor_encoder.counts_per_turn),
         gear_motor_turns=1,

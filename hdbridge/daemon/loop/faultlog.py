@@ -1,4 +1,4 @@
-"""Faults of the supervision as events: one when a fault begins, one when its reaction gets more severe."""
+"""Faults of the supervision as events: one when a fault begins, one when its reaction becomes more severe."""
 
 import math
 from typing import Final, Protocol

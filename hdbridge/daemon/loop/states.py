@@ -1,7 +1,7 @@
 """State table of an axis in the control loop.
 
 This module contains the states, the rows, and the functions that follow from them alone: the accepted
-commands, the text of a refusal, the diagram. It uses no bus, clock or drive. The drive has its own power
+commands and the text of a refusal. It uses no bus, clock or drive. The drive has its own power
 states (`hdbridge.drive.states`); these states determine what the loop may do with the axis. A command without
 a row is refused and changes nothing.
 
@@ -146,25 +146,3 @@ def refusal(axis: str, state: AxisState, kind: CommandKind) -> str:
 def label(name: AxisState | CommandKind) -> str:
     """Returns a name in words, such as ``quick stopped``."""
     return name.name.lower().replace("_", " ")
-
-
-def mermaid() -> str:
-    """Returns the table as a Mermaid state diagram, without rows that keep the state.
-
-    A transition that most states share is a note at its target in place of as many arrows.
-    """
-    lines = ["stateDiagram-v2", f"    [*] --> {AxisState.UNVERIFIED.name}"]
-    causes: dict[tuple[AxisState, AxisState], list[str]] = {}
-    for row in TRANSITIONS:
-        if row.source is not row.target:
-            words = row.cause.value if isinstance(row.cause, Trigger) else row.cause.name
-            causes.setdefault((row.source, row.target), []).append(str(words))
-    sources: dict[tuple[AxisState, str], list[str]] = {}
-    for (source, target), each in causes.items():
-        sources.setdefault((target, ", ".join(each)), []).append(source.name)
-    for (target, cause), names in sources.items():
-        if len(names) > len(AxisState) / 2:
-            lines.append(f"    note right of {target.name}: {cause} (from {', '.join(names)})")
-        else:
-            lines += [f"    {name} --> {target.name}: {cause}" for name in names]
-    return "\n".join(lines)

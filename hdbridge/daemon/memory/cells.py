@@ -142,7 +142,7 @@ class SettingSlot:
         """Stores a setting; returns its number, the argument of CHANGE. Raises InputError if too large."""
         if len(data) > self._capacity:
             raise InputError(
-                f"the compensation takes {len(data)} bytes, the control process takes at most "
+                f"the compensation has {len(data)} bytes, but the control process accepts at most "
                 f"{self._capacity}: use a model with fewer effects"
             )
         with self._putting:

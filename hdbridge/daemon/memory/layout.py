@@ -1,6 +1,6 @@
 """Layout of the shared memory: enumerations, slots of each ring, and their offsets. Data only.
 
-    header      magic, version, axes, period, sizes, and the status cells
+    header      mark of the layout, axes, period, and the status cells
     samples     one slot per cycle, newest `SAMPLES_KEPT`           control process -> service
     events      newest `EVENTS_KEPT`                                control process -> service
     incoming    newest CAN frames outside the cycle                 control process -> service
@@ -18,12 +18,12 @@ sequence number, counted from 1. Any change here requires a new `VERSION`.
 import logging
 import math
 import struct
+import zlib
 from enum import IntEnum, IntFlag
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 
-MAGIC: Final = b"hdbridge"
 VERSION: Final = 6
 PAGE: Final = 4096
 LINE: Final = 64
@@ -196,7 +196,7 @@ class Knot(NamedTuple):
 
 
 class OuterKnot(NamedTuple):
-    """Set-point of the gateway: the load's position at a time, with linear motion from the one before."""
+    """Set-point of the gateway: the load's position at a time, with linear motion from the previous one."""
 
     series: int
     """Number of the series; set-points of other series are discarded."""
@@ -330,8 +330,8 @@ COMMAND: Final = struct.Struct(f"@Qii3d3q{TAIL_CODE}")
 """sequence (which is the id), kind, axis, a-c, i-k."""
 KNOT: Final = struct.Struct(f"@Qq3d{TAIL_CODE}")
 """sequence, stream, time, position, velocity."""
-HEADER: Final = struct.Struct("@8sIIQQQI4x")
-"""magic, version, axes, period in ns, total bytes, crc of the layout's sizes, flag for checksums in slots."""
+HEADER: Final = struct.Struct("@IIQ?")
+"""Mark of the layout, axes, period in ns, flag for checksums in slots."""
 STATUS_OFFSET: Final = 1024
 """Offset of the status cells in the header's page."""
 
@@ -383,3 +383,8 @@ class Layout(NamedTuple):
             outer=tuple(place(len(OuterCell), LINE) for _ in range(axes)),
             total=-(-end // PAGE) * PAGE,
         )
+
+    @property
+    def mark(self) -> int:
+        """Checksum of the version and the offsets, which identifies memory of the same release."""
+        return zlib.crc32(repr((VERSION, self)).encode())

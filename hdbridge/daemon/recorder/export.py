@@ -78,7 +78,7 @@ def exported(
     pieces = _split(rows, cuts)
     parts = [_record(each, known[0], period_s) for each in pieces if len(each["cycle"]) >= PART_SAMPLES]
     if not parts:
-        state = "" if all_states else " while it was enabled (--all-states takes the rest, too)"
+        state = "" if all_states else " while it was enabled (--all-states includes the rest)"
         raise InputError(
             f"{flights[0].path}: nothing of axis '{known[0].name}' to export{state}: "
             f"{len(rows['cycle'])} such cycles, fewer than {PART_SAMPLES} in a row"

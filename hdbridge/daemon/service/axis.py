@@ -199,7 +199,7 @@ class ServiceAxis:
                 await link.do(CommandKind.DRIVE_FAULT_RESET)
                 if not await self.core.until(lambda: link.power is not State.FAULT, FAULT_RESET_S):
                     raise DriveError(
-                        f"{self.name}: the drive's fault stays after a reset; remove its cause (see 603Fh "
+                        f"{self.name}: the drive's fault persists after a reset; remove its cause (see 603Fh "
                         f"and the drive's manual), then reset it again: hdbridge ctl reset {self.name}"
                     )
             await self._rest()

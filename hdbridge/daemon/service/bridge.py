@@ -111,9 +111,15 @@ class ServiceBridge:
             self.core.start(self._take_over(axis))
             # The drive is booted and verified whenever necessary; the axis stays disabled.
             for is_due, attempt, pauses_s, failure in (
-                (self._is_unsettled, axis.settle, SETTLE_AGAIN_S, "the compensation could not be changed"),
-                (self._is_unverified, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified"),
-            ):
+                (
+                    lambda axis: not axis.models.settled,
+                    axis.settle, SETTLE_AGAIN_S, "the compensation could not be changed",
+                ),
+                (
+                    lambda axis: axis.link.state in UNKNOWN and self._bus_up,
+                    axis.verify, VERIFY_AGAIN_S, "the drive could not be verified",
+                ),
+            ):  # fmt: skip
                 self.core.start(self._persist(axis, is_due, attempt, pauses_s, failure))
         if (gateway := self.machine.gateway) is not None:
             master = OuterMaster(self.core, gateway)
@@ -163,12 +169,6 @@ class ServiceBridge:
                 self.axes[self._names[event.axis]].on_event(event)
             elif event.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP):
                 self._bus_up = event.kind is EventKind.BUS_UP
-
-    def _is_unsettled(self, axis: ServiceAxis) -> bool:
-        return not axis.models.settled
-
-    def _is_unverified(self, axis: ServiceAxis) -> bool:
-        return axis.link.state in UNKNOWN and self._bus_up
 
     async def _persist(
         self,

@@ -75,7 +75,7 @@ class RelayBus(can.BusABC):
         if (reason := refusal_reason(can_id, data, self._nodes)) is not None:
             raise can.CanOperationError(reason)
         if not self._outgoing.add(RelayedFrame(int(1e9 * self._clock.now()), can_id, data)):
-            raise can.CanOperationError("the control process takes no frames: it hangs or is gone")
+            raise can.CanOperationError("the control process accepts no frames: it hangs or has ended")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         clock = self._clock

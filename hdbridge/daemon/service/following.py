@@ -50,19 +50,16 @@ class Following:
         """
         self.state = messages.AdaptationState(mode=settings.mode)
         """State of the adaptation."""
-        self.advice: list[str] = []
-        """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
         self._axis = axis
         self._settings, self._folder = settings, folder
         self._worker, self._diagnosis = worker, diagnosis
-        self._model: TransmissionModel | None = None
-        """Committed model that is followed."""
-        self._used: TransmissionModel | None = None
-        """Model that the control process uses, adapted or not."""
+        self._model = self._used = axis.models.chosen.model
+        """Committed model that is followed, and the model that the control process uses, adapted or not."""
         self._sent = self._taken = 0
-        # These belong to the worker's thread.
-        self._follower: Follower | None = None
+        # From here on, these belong to the worker's thread.
         self._problem = ""
+        self._follow(self._model)
+        self._do(self._adapt)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes samples from the service's core. Lost samples appear as a gap in the cycle numbers."""
@@ -95,7 +92,7 @@ class Following:
         """Chooses the adapted model, which the axis then sends to the control process."""
         models, follower = self._axis.models, self._follower
         chosen = models.chosen
-        if follower is None or follower.adaptation is None or chosen.model is not follower.model:
+        if follower.adaptation is None or chosen.model is not follower.model:
             return
         model = follower.adaptation.model
         used = chosen.adapted or chosen.model
@@ -115,16 +112,20 @@ class Following:
 
     def _begin(self, model: TransmissionModel) -> None:
         """Starts to follow another committed model."""
-        self._save()
+        self._follower.save()
+        self._follow(model)
+        self._adapt()
+
+    def _follow(self, model: TransmissionModel) -> None:
         self._follower = Follower(self._axis.axis.config, model, self._axis.link.index, self._settings)
         self.advice = self._unwatched()
-        self._adapt()
+        """Current verdict of the watch unless the model is valid; the reason if the axis is not watched."""
 
     def _adapt(self) -> None:
         """Starts the adaptation, or changes its mode, according to the settings."""
         follower, settings = self._follower, self._settings
         self._problem = ""
-        if follower is None or (follower.adaptation is None and settings.mode == "off"):
+        if follower.adaptation is None and settings.mode == "off":
             pass
         elif not follower.model.effects:
             self._problem = "there is no model to follow: calibrate first"
@@ -144,28 +145,25 @@ class Following:
     def _process(self, samples: SampleArray) -> None:
         try:
             follower = self._follower
-            if follower is not None and (raised := follower.take(samples)) is not None:
+            if (raised := follower.take(samples)) is not None:
                 self._report(raised, follower.model)
                 self._publish()
         finally:
             self._taken += 1
 
     def _revert(self) -> None:
-        if self._follower is not None:
-            self._follower.revert()
-            self._publish()
+        self._follower.revert()
+        self._publish()
 
     def _use(self, model: TransmissionModel) -> None:
-        if self._follower is not None:
-            self._follower.use_model(model)
+        self._follower.use_model(model)
 
     def _save(self) -> None:
-        if self._follower is not None:
-            self._follower.save()
+        self._follower.save()
 
     def _publish(self) -> None:
         follower = self._follower
-        if follower is not None and follower.adaptation is not None:
+        if follower.adaptation is not None:
             self.state = follower.state()
         else:
             self.state = messages.AdaptationState(mode=self._settings.mode, frozen=self._problem or None)
@@ -181,8 +179,7 @@ class Following:
                 self._diagnosis.start(self._axis.name, model.dump(), WINDOW_S / 60.0, each.text, report)
 
     def _unwatched(self) -> list[str]:
-        follower = self._follower
-        return [follower.unwatched] if follower is not None and follower.unwatched else []
+        return [self._follower.unwatched] if self._follower.unwatched else []
 
     def _note(self, kind: str, text: str) -> None:
         self._axis.core.log.note(text, self._axis.link.index, kind)

@@ -36,7 +36,7 @@ class AxisMotion:
     """Current motion of one axis and its queue. Every method that begins a motion requires the lease."""
 
     def __init__(self, link: AxisLink, check: Callable[[str], None]) -> None:
-        """``check`` raises LeaseError if a token is not that of the lease's current holder."""
+        """``check`` raises LeaseError unless it is called with the token of the lease's current holder."""
         self._link, self._check = link, check
         self.activity: Activity | None = None
         self._points: deque[QueueItem] = deque()

@@ -132,7 +132,7 @@ class OuterMaster:
                     self._core.log.note(f"for {self._name}: {error}", axis.link.index)
 
     def _has_stale_power(self, axis: ServiceAxis, cells: OuterCells) -> bool:
-        """Returns True if the axis has power from a request that is over, of this or an earlier process."""
+        """Returns True if the axis still has power from an ended request, to this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
         return axis.link.state in _POWERED and granted != 0 and cells[OuterCell.REQUESTED] != granted
 
@@ -144,7 +144,7 @@ class OuterMaster:
             return not self._core.lease.holds(token) or cells[OuterCell.REQUESTED] != series
 
         try:
-            # A master may enable again while the axis still brakes from the last time.
+            # A master may enable the axis again while it is still braking after the previous request.
             await link.core.until(
                 lambda: (
                     link.state is not AxisState.STOPPING and link.power is not State.NOT_READY_TO_SWITCH_ON

@@ -122,7 +122,9 @@ def _checked(account: str) -> str:
     try:
         number = pwd.getpwnam(account).pw_uid
     except KeyError:
-        raise InputError(f"--account {account}: no such user; make it: useradd --system {account}") from None
+        raise InputError(
+            f"--account {account}: no such user; create it: useradd --system {account}"
+        ) from None
     if number == 0:
         raise InputError("--account root: the daemon needs no rights of root; give another user")
     return account

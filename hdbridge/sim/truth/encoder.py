@@ -58,7 +58,7 @@ class TrueLoss(Strict):
     """One loss of counts, which remains in the reading."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
-    counts: int = Field(ge=-(2**31), le=2**31 - 1, description="counts that the reading jumps by")
+    counts: int = Field(ge=-(2**31), le=2**31 - 1, description="size of the jump, counts")
 
 
 class TrueEncoder(Strict):

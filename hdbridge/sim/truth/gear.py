@@ -97,10 +97,12 @@ class TrueRoller(Strict):
     """Roller on the motor's hub, which is pressed more strongly at some load angles than at others."""
 
     order: float = Field(gt=0, le=512, description="turns of the roller per motor turn, not a whole number")
-    amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude where it is pressed on most")
+    amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude at the strongest pressure")
     phase_deg: float = Field(0.0, ge=-360, le=360, description="phase at the motor angle zero")
-    pressed_at_deg: float = Field(0.0, ge=-360, le=360, description="load angle where it is pressed on most")
-    sharpness: float = Field(1.0, gt=0, le=50, description="sharpness of the pressure's fall-off from there")
+    pressed_at_deg: float = Field(0.0, ge=-360, le=360, description="load angle of the strongest pressure")
+    sharpness: float = Field(
+        1.0, gt=0, le=50, description="sharpness of the pressure's fall-off from that angle"
+    )
 
 
 class TrueSeat(Strict):
@@ -145,7 +147,7 @@ class TrueGear(Strict):
     )
     rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")
     wear: TrueWear | None = Field(None, description="lost motion by the travel; without it: none")
-    ageing: TrueAgeing | None = Field(None, description="what hours of work change; without it: nothing")
+    ageing: TrueAgeing | None = Field(None, description="changes with hours of work; without it: none")
     creep: tuple[TrueCreep, ...] = Field((), max_length=16, description="elements that yield in time")
     teeth: int | None = Field(None, ge=3, le=100_000, description="teeth of the output; else twice the ratio")
     jumps: tuple[TrueJump, ...] = Field((), description="teeth jumped, each at its time")

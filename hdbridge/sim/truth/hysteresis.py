@@ -24,7 +24,7 @@ class RollingFriction(Strict):
     law: Literal["rolling_friction"] = Field(description="the article's law; no return-point memory")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
     width_deg: float = Field(gt=0, le=36_000, description="motor travel of the crossing")
-    exponent: float = Field(ge=1, le=10, description="shape of the crossing, n; at 1 it jumps across")
+    exponent: float = Field(ge=1, le=10, description="exponent n of the crossing; 1 is a jump")
     start_arcsec: float = Field(0.0, description="error at the start")
 
     @model_validator(mode="after")
@@ -41,7 +41,7 @@ class RollingFriction(Strict):
 class SlipElement(Strict):
     """Spring in series with a slider."""
 
-    limit_arcsec: float = Field(ge=0, le=36_000, description="error at which it slips")
+    limit_arcsec: float = Field(ge=0, le=36_000, description="error at which the slider slips")
     yield_deg: float = Field(gt=0, le=36_000, description="motor travel from zero to slipping")
 
 

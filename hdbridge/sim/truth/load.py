@@ -23,14 +23,14 @@ class TrueStribeck(Strict):
     breakaway_nm: float = Field(
         ge=0, le=1e6, description="friction at rest, in place of the Coulomb friction"
     )
-    speed_rad_s: float = Field(gt=0, le=100, description="load speed by which it has come down to 1/e")
+    speed_rad_s: float = Field(gt=0, le=100, description="load speed at which the increase has fallen to 1/e")
 
 
 class TrueThinning(Strict):
     """Grease that thins when sheared: viscous friction / (1 + speed / ``speed_rad_s``)^exponent."""
 
-    speed_rad_s: float = Field(gt=0, le=1_000, description="load speed at which it sets in")
-    exponent: float = Field(0.5, gt=0, le=1, description="how much; 1 ends at a constant torque")
+    speed_rad_s: float = Field(gt=0, le=1_000, description="load speed at which thinning begins")
+    exponent: float = Field(0.5, gt=0, le=1, description="degree of thinning; 1 ends at a constant torque")
 
 
 class TrueVibration(Strict):
@@ -44,7 +44,7 @@ class TrueVibration(Strict):
 class TrueSlip(Strict):
     """Spring between load and ground that slips at its torque limit."""
 
-    limit_nm: float = Field(gt=0, le=1e6, description="friction at which it slips")
+    limit_nm: float = Field(gt=0, le=1e6, description="friction at which the spring slips")
     travel_deg: float = Field(gt=0, le=360, description="load travel from no friction to slipping")
 
 
@@ -64,7 +64,8 @@ class TrueLoad(Strict):
     gravity: TrueGravity | None = Field(None, description="a mass on the axis; without it: balanced")
     vibration: tuple[TrueVibration, ...] = Field((), max_length=16, description="shaking from outside")
     torque_sense: Literal[1, -1] = Field(
-        1, description="sign of the reported torque: 1 pushes the load forward, -1 is what the gear delivers"
+        1,
+        description="sign of the reported torque: 1: it pushes the load forward, -1: the gear delivers it",
     )
     encoder: TrueLoadEncoder = Field(description="encoder at the load")
 

@@ -13,10 +13,8 @@ class TrueMotorStribeck(Strict):
     forms.
     """
 
-    rise: float = Field(
-        ge=0, le=10, description="fraction of the Coulomb friction by which it is higher at rest"
-    )
-    speed_rad_s: float = Field(gt=0, le=1_000, description="motor speed by which that has come down to 1/e")
+    rise: float = Field(ge=0, le=10, description="increase at rest, as a fraction of the Coulomb friction")
+    speed_rad_s: float = Field(gt=0, le=1_000, description="speed at which the increase has fallen to 1/e")
 
 
 class TrueMotor(Strict):
@@ -70,7 +68,7 @@ class TrueResponse(Strict):
         (), max_length=4096, description="added to the reported torque, per speed of the command"
     )
     torque_nm: tuple[float, ...] = Field(
-        (), max_length=4096, description="added to it in the direction of the command"
+        (), max_length=4096, description="added to the reported torque in the direction of the command"
     )
 
 
@@ -83,7 +81,7 @@ class TrueServo(Strict):
     )
     integral_time_ms: float = Field(gt=0, le=10_000, description="velocity loop: integral time")
     integral_of: Literal["speed", "position"] = Field(
-        "speed", description="error that the integral adds up: PI on the speed, or PIV"
+        "speed", description="error that is integrated: speed (PI) or position (PIV)"
     )
     integral_dead_band: float = Field(
         1.0,
@@ -96,7 +94,7 @@ class TrueServo(Strict):
         16.0,
         ge=0,
         le=100_000,
-        description="overshoot within which it rests, so as not to turn back and hunt, in interpolated steps",
+        description="overshoot within which the motor rests and does not hunt, in interpolated steps",
     )
     command_filter_ms: float = Field(
         gt=0, le=100, description="time constant of the second-order filter on the demand"
@@ -121,7 +119,7 @@ class TrueServo(Strict):
     friction_feedforward_nm: float = Field(
         0.0, ge=0, le=10_000, description="torque in the direction of the last demanded motion"
     )
-    dead_time_ms: float = Field(0.0, ge=0, le=100, description="age of the demand when the loops take it in")
+    dead_time_ms: float = Field(0.0, ge=0, le=100, description="age of the demand when the loops use it")
     torque_limit_percent: float = Field(gt=0, le=1_000, description="highest torque, of the rated one")
     response: TrueResponse | None = Field(
         None,

@@ -30,13 +30,19 @@ class TrueTemperature(Strict):
     resistance_k_per_w: float = Field(1.0, ge=0, le=1_000, description="warming per watt of losses")
     time_constant_s: float = Field(1_200.0, gt=0, le=1e6, description="time constant of the warming")
     copper_loss_w: float = Field(
-        0.0, ge=0, le=1e5, description="loss in the winding at rated torque; it goes with the torque squared"
+        0.0,
+        ge=0,
+        le=1e5,
+        description="loss in the winding at rated torque, proportional to the torque squared",
     )
     zero_drift_arcsec_per_k: float = Field(
         0.0, ge=-3_600, le=3_600, description="shift of the gear's output per kelvin above ambient"
     )
     zero_time_constant_s: float = Field(
-        0.0, ge=0, le=1e6, description="time by which that shift follows the temperature; 0: at once"
+        0.0,
+        ge=0,
+        le=1e6,
+        description="time constant with which the shift follows the temperature; 0: at once",
     )
     reference_c: float | None = Field(
         None, ge=-60, le=200, description="temperature at which the growths below are none; else ambient"
@@ -46,12 +52,14 @@ class TrueTemperature(Strict):
         0.0, ge=-1, le=1, description="growth of the motor's friction and of the hysteresis per kelvin"
     )
     ambient_k_per_hour: float = Field(
-        0.0, ge=-100_000, le=100_000, description="how the surroundings warm up"
+        0.0, ge=-100_000, le=100_000, description="steady warming of the surroundings"
     )
     ambient_swing_k: float = Field(
         0.0, ge=0, le=100, description="amplitude of the periodic change of the surroundings"
     )
-    ambient_period_s: float = Field(3_600.0, gt=0, le=1e6, description="period of that")
+    ambient_period_s: float = Field(
+        3_600.0, gt=0, le=1e6, description="period of the change of the surroundings"
+    )
 
     @property
     def unchanged_c(self) -> float:
@@ -78,10 +86,10 @@ class Truth(Strict):
     temperature: TrueTemperature = Field(default_factory=TrueTemperature, description="heat")
     firmware: Behaviour = Field(default_factory=Behaviour, description="choices of the drive's firmware")
     intervals: dict[str, tuple[float, float]] = Field(
-        default_factory=dict, description="95 % intervals of the values that were fitted, by their place"
+        default_factory=dict, description="95 % intervals of the fitted values, by key"
     )
     provenance: dict[str, Any] = Field(
-        default_factory=dict, description="where the values come from; the simulated drive does not read it"
+        default_factory=dict, description="origin of the values; the simulated drive does not read it"
     )
 
     @classmethod
