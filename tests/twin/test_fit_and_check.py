@@ -239,13 +239,20 @@ def test_growth_follows_a_change_of_any_size_and_not_a_single_reading() -> None:
     assert max(growth(data, stray, scale).values()) < 1.1
 
 
-def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
+def test_a_twin_that_leaves_all_of_a_signal_shows_only_measured_changes() -> None:
     known = replay_only()
     about = known.provenance["fit"]
+    assert about["mechanics"]
     huge = {name: {kind: 1e6 * rms for kind, rms in by.items()} for name, by in about["misfit"].items()}
-    lost = known.model_copy(update={"provenance": {**known.provenance, "fit": {**about, "misfit": huge}}})
-    checked = check(recorded(seed=1), AXIS, lost, workers=1)
-    assert checked.sentence == "The twin explains too little of this axis to show a change."
+    for mechanics in (about["mechanics"], {}):
+        fit = {**about, "misfit": huge, "mechanics": mechanics}
+        lost = known.model_copy(update={"provenance": {**known.provenance, "fit": fit}})
+        checked = check(recorded(seed=1), AXIS, lost, workers=1)
+        assert not checked.changes
+        if mechanics:
+            assert not {"friction", "load inertia", "gear stiffness"} & {*checked.unseen}
+        else:
+            assert checked.sentence == "The twin explains too little of this axis to show a change."
 
 
 def test_unexplained_changes_are_reported() -> None:
