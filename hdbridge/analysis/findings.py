@@ -26,7 +26,7 @@ from hdbridge.units import figure
 
 _UNEXPLAINED: Final = {
     "load angle": "two slow load turns both ways, then again with the load encoder re-clocked by 90 deg",
-    "reversal": "nested reversals from 0.1 deg up, each beyond where the last one turned, slowly",
+    "reversal": "nested reversals from 0.1 deg up, each beyond the last turning point, slowly",
     "motor angle": "a slow sweep over ten motor turns both ways, at two places of the load",
     "speed": "the same way at three speeds and two accelerations, with rests of a minute between",
     "torque": "the same sweep with the load's mass at two places",

@@ -130,7 +130,7 @@ def swing(
 
 
 def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice]) -> FloatArray:
-    """Returns the second derivative of a natural spline through each part of the base's path, shape (n,)."""
+    """Returns the second derivative of a natural spline through the base angles of each part, shape (n,)."""
     ends = [row for each in parts for row in (each.start, each.stop - 1)]
     band, right = np.zeros((3, len(base_arcsec))), np.zeros(len(base_arcsec))
     band[1, 1:-1] = (step_s[:-1] + step_s[1:]) / 3.0

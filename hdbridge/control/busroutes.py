@@ -28,7 +28,7 @@ class Routes(NamedTuple):
 
     speaking: tuple[AxisCycle, ...]
     listening: tuple[AxisCycle, ...]
-    """Silent axes."""
+    """Axes to which no RPDO is sent."""
     slots: dict[int, Slot]
     """TPDOs that may come with each SYNC, by identifier."""
     listeners: dict[int, AxisCycle]

@@ -211,7 +211,7 @@ class LoadLoop:
             self._end()
 
     def _observe(self, error: float, difference: float, motor: float) -> None:
-        """Evaluates a reading at rest, after the load has settled; starts or ends a doubt."""
+        """Evaluates a reading at rest, after the load has settled; begins or ends a doubt."""
         deviation = difference - self._difference
         explained = self._explained() + 2.0 * abs(motor - self._motor)
         if abs(deviation) > explained:

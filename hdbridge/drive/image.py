@@ -238,7 +238,7 @@ class ProcessImage:
     # -- sent frames --------------------------------------------------------------------------------------
 
     def _packer(self, layout: Layout, od: ObjectDictionary) -> Callable[[int, int], tuple[int, bytes]]:
-        """Returns a function that builds an RPDO frame from controlword and target, as far as it has them.
+        """Returns a function that builds an RPDO frame from those of controlword and target that it contains.
 
         A read-only mapping may contain other objects. The mode of operation then has the value for the cycle;
         all others have their value from the EDS, or 0 if the EDS states none.
