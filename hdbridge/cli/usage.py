@@ -54,7 +54,7 @@ def _checked(param: Any, convert: Callable[[Any, Any], Any], context: Any, value
         if isinstance(each, float) and not math.isfinite(each):
             limits = getattr(param, "type", param)
             limits = _range(getattr(limits, "min", None), getattr(limits, "max", None))
-            raise _wrong(param, context, each, f"a number{limits}")
+            raise _wrong(param, context, each, f"a finite number{limits}")
         if isinstance(each, Path) or (isinstance(each, str) and param.metavar in _PLACES):
             try:
                 os.stat(each)  # noqa: PTH116 - called for its errors
