@@ -123,6 +123,32 @@ def test_homing_is_over_only_if_the_drive_shows_its_start(method: int, counts: i
             assert node.state != ENABLED
 
 
+def test_a_move_is_over_only_where_it_ends() -> None:
+    """The drive reports its target as reached and stands still."""
+    with booted() as (drive, _):
+        drive.move_to(0.0)
+    with booted() as (drive, node):
+        with pytest.raises(TransitionError, match="arrival at 5 deg did not occur"):
+            drive.move_to(5.0)
+        assert node.state != ENABLED
+
+
+def test_a_drive_that_restarts_under_power_is_switched_off_first() -> None:
+    with booted() as (drive, node):
+        drive.enable(Mode.PP)
+        node.ways = Ways(keeps_power=True, starts_itself=True)
+        resets: list[int] = []
+        restart = node.restart
+
+        def reset(**how: bool) -> None:
+            resets.append(node.state)
+            restart(**how)
+
+        node.restart = reset  # type: ignore[method-assign]
+        drive.boot()
+        assert resets == [OFF]
+
+
 def test_a_drive_that_is_not_enabled_in_time_has_no_power_on_the_bench() -> None:
     with booted(ignores_enable=True) as (drive, node):
         bench = Bench(drive)
