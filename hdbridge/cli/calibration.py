@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from typer import Argument, Option
 
@@ -21,7 +21,6 @@ from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.axis.model.store import Store
     from hdbridge.cli.session import Session
     from hdbridge.commissioning.calibration import Calibration, Callbacks, Journal, Validation
     from hdbridge.commissioning.calibration.pipeline import Offer
@@ -115,18 +114,18 @@ class Measurement:
         return start_journal(self.folder, self.session.axis, self.plan, self.date, drive.identity, about)
 
     @contextmanager
-    def booted(self, store: Store[Any] | None = None) -> Iterator[tuple[Drive, Callbacks]]:
+    def booted(self) -> Iterator[tuple[Drive, Callbacks]]:
         """Yields the booted drive, and the functions that a measurement calls.
 
-        Locks the axis against other measurements. ``store`` is where the result is proposed, if anywhere. If
-        the measurement fails, prints the location of its record; removes an empty folder.
+        Locks the axis against other measurements. If the measurement fails, prints the location of its
+        record; removes an empty folder.
         """
         from hdbridge.axis.model.store import measuring
         from hdbridge.commissioning.calibration import Callbacks
 
         try:
             with (
-                measuring(self.session.files.axis, store),
+                measuring(self.session.files.axis),
                 self.session.booted() as (drive, interrupted),
                 phases() as progress,
             ):
@@ -168,13 +167,14 @@ def calibrate(
     from hdbridge.commissioning.calibration.motion import motion_test_s
     from hdbridge.commissioning.calibration.validation import validation_s
 
+    MODELS.check_pending(session.files.folder)
     work, axis = measured.of(session), session.axis
     test_s = validation_s(work.plan, axis)
     if work.plan.validation.motion:
         with suppress(InputError):  # too little travel: the calibration reports it and skips the test
             test_s += motion_test_s(axis)
     work.announce(f"{test_s / 60:.1f} min to test the model")
-    with work.booted(MODELS) as (drive, callbacks):
+    with work.booted() as (drive, callbacks):
         result = calibrate(drive, work.begun(drive), session.files.folder, work.date, callbacks)
     _conclude(result, work.folder, json_file, html_file, session)
 

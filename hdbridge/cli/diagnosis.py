@@ -305,6 +305,7 @@ def improve(
     if given and measured.resume is not None:
         raise InputError("--from and --resume exclude each other: leave one of them out")
     recordings = csv.load(given or ())  # refused before anything is connected
+    MODELS.check_pending(session.files.folder)
     work = measured.of(session)
     test_min = trial_s(work.plan, axis, active) / 60
     trial = f"{test_min:.1f} min to step with both models, if something is found"
@@ -312,7 +313,7 @@ def improve(
         note(f"no measurement first; {trial}")
     else:
         work.announce(trial)
-    with work.booted(MODELS) as (drive, callbacks):
+    with work.booted() as (drive, callbacks):
         journal = None if recordings else work.begun(drive)
         source = Source(work.plan, work.folder, journal, recordings, independent_zeros)
         rounds = rounds if auto else 0

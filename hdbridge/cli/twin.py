@@ -104,7 +104,8 @@ def _learned(
     from hdbridge.report.twin import TwinReport
     from hdbridge.twin.twin import TWINS, TwinFile, fit_twin, judge
 
-    with measuring(files.axis, TWINS), progress_bar() as bar:
+    TWINS.check_pending(files.folder)
+    with measuring(files.axis), progress_bar() as bar:
         task = bar.add_task("fit", total=1.0)
         twin = fit_twin([recording], axis, begun.truth, lambda share: bar.update(task, completed=share))
         verdict = judge(twin)

@@ -89,6 +89,7 @@ class Profile:
             path = bundled_profile(text)
         if not path.is_dir():
             return cls(path, path.parent / "model.yaml", path.parent / "truth.yaml")
-        if not (path / "axis.yaml").is_file():
+        axis = path / "axis.yaml"
+        if axis.is_dir() or not axis.exists():
             raise InputError(f"{path}: has no file axis.yaml; expected the folder of an axis")
-        return cls(path / "axis.yaml", path / "model.yaml", path / "truth.yaml")
+        return cls(axis, path / "model.yaml", path / "truth.yaml")

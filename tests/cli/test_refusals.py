@@ -24,10 +24,21 @@ from hdbridge.records.record import Record
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 LONG = "x" * 300
-UNREADABLE = ("", "pipe", "nowhere/at/all", "circle", LONG, "junk", "empty", "/dev/zero", "/dev/null")
+UNREADABLE = (
+    "",
+    "b\udcfcro",
+    "pipe",
+    "nowhere/at/all",
+    "circle",
+    LONG,
+    "junk",
+    "empty",
+    "/dev/zero",
+    "/dev/null",
+)
 UNWRITABLE = {
-    "file": ("", "circle", LONG, "junk", "axis", "nowhere/at/all", "junk/new"),
-    "folder": ("", "circle", LONG, "junk", "axis", "junk/new", "pipe"),
+    "file": ("", "b\udcfcro", "circle", LONG, "junk", "axis", "nowhere/at/all", "junk/new"),
+    "folder": ("", "b\udcfcro", "circle", LONG, "junk", "axis", "junk/new", "pipe"),
 }
 RIGHT = {
     "PROFILE": "axis", "MACHINE": "axis", "NAME": "fresh", "RECORD": "record.csv", "RECORDING": "record.csv",

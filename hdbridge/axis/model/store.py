@@ -159,6 +159,10 @@ class Store(Generic[K]):
             + (f"expected one of: {names}" if names else f"none is stored yet: {self.first}")
         )
 
+    def check_pending(self, profile: Path) -> None:
+        """Raises `InputError` if a pending version cannot be written; to be called before a measurement."""
+        check_writable(profile / self.pending)
+
     def propose(
         self,
         profile: Path,
@@ -350,14 +354,12 @@ def _iso(date: datetime) -> str:
 
 
 @contextmanager
-def measuring(axis_file: Path, store: Store[Any] | None = None) -> Iterator[None]:
+def measuring(axis_file: Path) -> Iterator[None]:
     """Locks a profile for one measurement at a time, because a second proposal would replace the first.
 
-    The lock applies to all processes, and is released when its process ends. Raises `InputError` at once if
-    another process holds it, or if the pending version of ``store`` cannot be written afterwards.
+    The lock applies to all processes. If another process holds it, raises `InputError` at once. The lock is
+    released when its process ends.
     """
-    if store is not None:
-        check_writable(axis_file.with_name(store.pending))
     try:
         file = os.open(axis_file, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as problem:
