@@ -252,6 +252,14 @@ def test_a_profile_that_cannot_be_written_is_refused_before_a_measurement(place,
     assert contents(place) == before
 
 
+def test_an_axis_file_that_is_a_folder_is_named_once(place):
+    (place / "axis" / "axis.yaml").unlink()
+    (place / "axis" / "axis.yaml").mkdir()
+    for profile in ("axis", "axis/axis.yaml"):
+        done = run_here(place, "check", profile, status=2)
+        assert f"{profile}: has no file axis.yaml; expected the folder of an axis" in done.stderr
+
+
 @pytest.mark.parametrize("name", ["axis.yaml", "model.yaml", "truth.yaml"])
 def test_a_named_pipe_in_a_profile_is_refused_at_once(place, name):
     (place / "axis" / name).unlink()

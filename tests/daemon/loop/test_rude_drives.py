@@ -160,6 +160,12 @@ STOPPING: dict[str, Disturbance] = {
     "pre-operational": lambda _, node: node.leave_operational(),
     "restart": lambda _, node: node.restart(),
     "restart with power": lambda _, node: restarts(node),
+    "another mode": lambda _, node: node.swap_mode(1),
+    "another mode for a while": lambda daemon, node: (
+        node.swap_mode(1),
+        daemon.run(0.1),
+        node.swap_mode(8),
+    ),
     "no TPDO any more": lambda _, node: setattr(node, "drop_tpdos", 10**6),
     "late TPDOs": lambda _, node: setattr(node, "hold_tpdos", 3),
     "jump by half the range of 6064h": lambda _, node: node.ways.jumps.append(1 << 31),
@@ -197,6 +203,18 @@ def test_what_stops_a_move_stops_it_for_good(name: str) -> None:
         assert node.state != ENABLED or node.nmt != 5
         (event,) = daemon.reported(EventKind.STOPPED)
         assert event.text
+
+
+def test_a_drive_that_runs_on_in_another_mode_is_stopped() -> None:
+    with moving() as (daemon, node):
+        node.ways.runs_on = True
+        node.swap_mode(3)
+        daemon.post(CommandKind.STOP)
+        daemon.run(0.5)
+        stopped = node.motor_counts
+        daemon.run(0.5)
+        assert node.motor_counts == stopped
+        assert daemon.states == [AxisState.QUICK_STOPPED]
 
 
 @pytest.mark.parametrize("frames", [300, 600])
