@@ -15,7 +15,10 @@ def main() -> None:
         from hdbridge.cli import main as run  # noqa: PLC0415 - loading takes a second, and Ctrl-C may come
 
         run()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, RuntimeError) as error:
+        # Python 3.11 turns an interrupt during the creation of a class into a RuntimeError.
+        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            raise
         sys.exit(130)
 
 

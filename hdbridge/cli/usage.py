@@ -18,6 +18,8 @@ UsageError: Any = typer.BadParameter.__mro__[1]
 subclass."""
 _PLACES = ("PROFILE", "MACHINE")
 """Metavars of the parameters that take a path or the name of a bundled profile."""
+_UNDECODED = re.compile("[\ud800-\udfff]")
+"""Bytes of the command line outside the encoding of the locale."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 
@@ -32,7 +34,7 @@ def refusal(error: Any) -> str:
 
 
 def strict(command: Any) -> Any:
-    """Makes a command refuse values that typer accepts: empty texts, NaN and infinity, impossible paths.
+    """Makes a command refuse values that typer accepts: empty or undecodable texts, infinity, wrong paths.
 
     The values are checked before the command runs and before its outputs are checked. An invalid one raises
     a one-line `InputError`.
@@ -49,12 +51,15 @@ def _checked(param: Any, convert: Callable[[Any, Any], Any], context: Any, value
     given = list(value) if isinstance(value, list | tuple) else [value]
     if "" in given and param.default != "":
         raise _wrong(param, context, "", "a text that is not empty")
+    for each in given:
+        if isinstance(each, str) and _UNDECODED.search(each):
+            raise _wrong(param, context, each, "a text in the encoding of this locale (see LC_ALL)")
     converted = convert(context, value)
     for each in converted if isinstance(converted, list | tuple) else [converted]:
         if isinstance(each, float) and not math.isfinite(each):
             limits = getattr(param, "type", param)
             limits = _range(getattr(limits, "min", None), getattr(limits, "max", None))
-            raise _wrong(param, context, each, f"a number{limits}")
+            raise _wrong(param, context, each, f"a finite number{limits}")
         if isinstance(each, Path) or (isinstance(each, str) and param.metavar in _PLACES):
             try:
                 os.stat(each)  # noqa: PTH116 - called for its errors

@@ -112,6 +112,9 @@ class Drive:
         self.report = None
         self._mode = None
         self._heartbeat.on = False
+        if reset:  # SYNC could apply a set-point that survives the reset
+            with suppress(HdbridgeError):
+                self._switch_off()
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients, self._heard).run(reset=reset)
         for note in self.report.notes:
             _log.warning("boot-up", {"node": self.axis.drive.node_id, "note": note})
@@ -254,6 +257,10 @@ class Drive:
         """
         self._commander.pause(duration_s)
 
+    def wait_for_standstill(self) -> bool:
+        """Waits until the motor stands still, by SDO; returns False if it does not within three seconds."""
+        return self._commander.wait_for_standstill()
+
     def move_to(
         self,
         load_deg: float,
@@ -367,6 +374,14 @@ class Drive:
         self._heartbeat.on = expected
 
     def _power_off(self) -> None:
+        quick = self._switch_off()
+        if self.can_set(objects.HEARTBEAT_CONSUMER):
+            # The master leaves on purpose; its silence from now on is not a fault.
+            with suppress(SdoAbortError):  # a drive that refuses this never monitored it
+                quick.store(objects.HEARTBEAT_CONSUMER, 0)
+
+    def _switch_off(self) -> SdoClient:
+        """Stops and disables the drive; returns the SDO client with short time-outs that it used."""
         quick = SdoClient(
             self.link,
             self.monitor,
@@ -387,10 +402,7 @@ class Drive:
             commander.wait_for(
                 "'switch on disabled'", lambda word: decode(word) in OFF, STEP_TIMEOUT_S, allow_fault=True
             )
-        if self.can_set(objects.HEARTBEAT_CONSUMER):
-            # The master leaves on purpose; its silence from now on is not a fault.
-            with suppress(SdoAbortError):  # a drive that refuses this never monitored it
-                quick.store(objects.HEARTBEAT_CONSUMER, 0)
+        return quick
 
     def _power_off_blindly(self) -> None:
         """Powers off without waiting for answers, because a drive may be unable to send."""

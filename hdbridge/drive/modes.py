@@ -229,26 +229,28 @@ def _end(
     timeout_s: float,
     place: tuple[int, float] | None,
 ) -> int:
-    """Waits for the end of an action: all of ``bits`` set, or `FAILED`.
+    """Waits for the end of an action: `FAILED`, or all of ``bits`` set with the motor at ``place``.
 
-    ``before`` is the statusword before the action was started. If it shows the end of an earlier action, the
-    drive must clear those bits first. Some drives take 50 ms for this, and an action that ends at once never
-    shows cleared bits. After `STALE_READINGS` readings, bits that are still set therefore end the wait if
-    they report a failure, or if the motor is at the ``place`` where the action ends (counts and tolerance;
-    None if it is not known). Raises `TransitionError` if the drive does not show the start otherwise.
+    ``place`` is where the action ends (counts and tolerance); None if it is not known. ``before`` is the
+    statusword before the action was started. If it shows the end of an earlier action, the drive must clear
+    those bits first. Some drives take 50 ms for this, and an action that ends at once never shows cleared
+    bits. After `STALE_READINGS` readings, bits that are still set therefore end the wait if they report a
+    failure, or if the motor is at the known place. Raises `TransitionError` if the drive does not show the
+    start otherwise.
     """
 
-    def over(word: int) -> bool:
-        return word & bits == bits or bool(word & FAILED)
+    def idle(word: int) -> bool:
+        return word & bits != bits and not word & FAILED
 
-    def ended_at_once(word: int) -> bool:
-        if word & FAILED or place is None:
-            return bool(word & FAILED)
+    def over(word: int) -> bool:
+        if idle(word) or word & FAILED or place is None:
+            return not idle(word)
         return abs(commander.sdo.fetch(objects.POSITION_ACTUAL) - place[0]) <= place[1]
 
-    if over(before):
+    if not idle(before):
         readings = count(1)
-        begun = lambda word: not over(word) or (next(readings) >= STALE_READINGS and ended_at_once(word))  # noqa: E731
+        sure = FAILED | bits if place else FAILED
+        begun = lambda word: idle(word) or (next(readings) >= STALE_READINGS and word & sure and over(word))  # noqa: E731
         _wait(commander, doing, f"the start of {doing} in the statusword", begun, STEP_TIMEOUT_S)
     return _wait(commander, doing, what, over, timeout_s)
 

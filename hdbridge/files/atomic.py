@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from hdbridge.errors import HdbridgeError, InputError, OutputError
+from hdbridge.errors import InputError, OutputError
 
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
@@ -165,22 +165,27 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already exists; expected a new folder, nothing was written")
     made = [each for each in folder.absolute().parents if not each.exists()]
-    aside = folder.with_name(f".{folder.name}.{os.getpid()}")
+    aside, place = folder.with_name(f".{folder.name}.{os.getpid()}"), folder
     try:
-        make_folder(aside)
+        aside.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
-            write_atomically(aside / name, content)
+            place = folder / name
+            with (aside / name).open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        place = folder
         aside.rename(folder)
     except BaseException as problem:
         shutil.rmtree(aside, ignore_errors=True)
         for each in made:
             with suppress(OSError):
                 each.rmdir()
-        if isinstance(problem, OSError):
-            raise OutputError(f"{folder}: cannot be written: {problem.strerror}") from None
-        if isinstance(problem, HdbridgeError):
-            raise type(problem)(str(problem).replace(str(aside), str(folder))) from None
-        raise
+        if not isinstance(problem, OSError):
+            raise
+        if place == folder:
+            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
+        raise OutputError(f"{place}: cannot be written: {problem.strerror}") from None
     return [folder / name for name in files]
 
 

@@ -59,6 +59,7 @@ _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d+))?$")
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?=[ T])")
 _FRACTION = re.compile(r"(?<=:\d\d)[.,](\d+)")
 _DAY_S: Final = 86_400.0
+_QUOTES: Final = "expected quotes in pairs"
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,10 +352,12 @@ class _Line:
     comment: bool
 
     def cells(self, separator: str) -> list[str]:
+        """Returns the cells; none if a quote in the line is not closed."""
         if separator == " ":
             return self.text.split()
         try:
-            return [cell.strip() for cell in next(csv.reader([self.text], delimiter=separator), [])]
+            reader = csv.reader([self.text], delimiter=separator, strict=True)
+            return [cell.strip() for cell in next(reader, [])]
         except csv.Error:
             return []
 
@@ -380,7 +383,11 @@ def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
     separator, header = _named_header(head, wanted) or _guessed_header(head)
     data = [line for line in rows if header is None or line.number > header.number]
     if header is None:  # lines above the numbers are not data
-        data = data[next((at for at, line in enumerate(data) if _holds_numbers(line, separator)), 0) :]
+        begin = next((at for at, line in enumerate(data) if _holds_numbers(line, separator)), 0)
+        for line in data[: begin + 1]:
+            if not line.cells(separator):
+                raise _wrong(f"{path}:{line.number}: a quote is not closed; {_QUOTES}")
+        data = data[begin:]
     first = [line.cells(separator) for line in data[:_SAMPLED]]
     cells = header.cells(separator) if header else [""] * len(first[0])
     if len(cells) > 1 and not cells[-1] and all(len(row) < len(cells) or not row[-1] for row in first):
@@ -404,14 +411,14 @@ def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
         remarks.append("no header, so columns have numbers")
     elif header.comment:
         remarks.append(f"the header in the comment of line {header.number}")
-    begin = header or data[0]
-    above = [line for line in rows if line.number < begin.number]
+    top = header or data[0]
+    above = [line for line in rows if line.number < top.number]
     if above:
         remarks.append(f"{len(above)} line{'s' * (len(above) > 1)} above the header left out")
     return _Layout(
         names,
         header.number if header else 0,
-        data[0].number - 1 if data and (units or not header) else begin.number,
+        data[0].number - 1 if data and (units or not header) else top.number,
         separator,
         comma,
         units,
@@ -492,7 +499,7 @@ def _is_paired(cells: Sequence[str], count: int) -> bool:
 
 def _parsed(path: Path, content: bytes, skipped: int, delimiter: str) -> Iterator[tuple[list[str], int]]:
     """Yields each non-blank row after the ``skipped`` lines, with the number of its first line."""
-    reader = csv.reader(_lines(content, skipped), delimiter=delimiter)
+    reader = csv.reader(_lines(content, skipped), delimiter=delimiter, strict=True)
     line = skipped + 1
     try:
         for row in reader:
@@ -500,7 +507,7 @@ def _parsed(path: Path, content: bytes, skipped: int, delimiter: str) -> Iterato
                 yield row, line
             line = skipped + reader.line_num + 1
     except csv.Error as problem:
-        raise _wrong(f"{path}:{line}: not CSV: {problem}; expected quotes in pairs") from None
+        raise _wrong(f"{path}:{line}: not CSV: {problem}; {_QUOTES}") from None
 
 
 def _column(cells: Sequence[str], *, blanks: bool, comma: bool) -> Column:

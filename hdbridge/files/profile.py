@@ -89,6 +89,7 @@ class Profile:
             path = bundled_profile(text)
         if not path.is_dir():
             return cls(path, path.parent / "model.yaml", path.parent / "truth.yaml")
-        if not (path / "axis.yaml").exists():
-            raise InputError(f"{path}: there is no axis.yaml in this folder; expected the folder of an axis")
-        return cls(path / "axis.yaml", path / "model.yaml", path / "truth.yaml")
+        axis = path / "axis.yaml"
+        if axis.is_dir() or not axis.exists():
+            raise InputError(f"{path}: has no file axis.yaml; expected the folder of an axis")
+        return cls(axis, path / "model.yaml", path / "truth.yaml")

@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -92,19 +93,16 @@ class _Composer:
 
     def _parse(self) -> Iterator[yaml.Event]:
         fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        seen = 0
         try:
-            yield from yaml.parse(self._text, Loader=fast)
+            try:
+                for event in yaml.parse(self._text, Loader=fast):
+                    yield event
+                    seen += 1
+            except yaml.YAMLError:  # the errors of the slow parser are clearer, and the same on all computers
+                yield from islice(yaml.parse(self._text, Loader=yaml.SafeLoader), seen, None)
         except yaml.YAMLError as problem:
-            raise self._not_yaml(self._in_better_words() or problem) from None
-
-    def _in_better_words(self) -> yaml.YAMLError | None:
-        """Returns the error of the pure-Python parser, which is clearer and the same on all computers."""
-        try:
-            for _ in yaml.parse(self._text, Loader=yaml.SafeLoader):
-                pass
-        except yaml.YAMLError as problem:
-            return problem
-        return None
+            raise self._not_yaml(problem) from None
 
     def _not_yaml(self, problem: yaml.YAMLError) -> FileError:
         what, line, column = "unreadable", 1, 1
@@ -315,6 +313,8 @@ class Document:
         node = self._node(at + place)
         field = field_at(model, place)
         what = expected_words(field) if field else error["msg"][0].lower() + error["msg"][1:]
+        if kind == "finite_number":
+            what = what.replace("number", "finite number", 1)
         choices = field.choices() if isinstance(node.value, str) and field else []
         hint = _hint(node.value, choices) if len(choices) > 1 else ""  # a single choice is expected anyway
         return place, f"found {node.found}; expected {what}" + (f"; {hint}" if hint else ""), False

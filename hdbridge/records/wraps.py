@@ -50,8 +50,9 @@ class Wraps(NamedTuple):
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
     """Finds jumps of constant size in an angle (n,) that do not occur in the axis's other angle (n,).
 
-    Returns None without such jumps. A single jump is accepted only if it equals a whole turn or a power of
-    two of counts. Steps to the first sample of a record (``starts``) are ignored.
+    Returns None without such jumps. They are accepted if they equal a whole turn or a power of two of counts,
+    or if all of them are at the ends of one period, unlike lost counts of equal size. Steps to the first
+    sample of a record (``starts``) are ignored.
     """
     if len(angle_deg) < 2 * WINDOW:
         return None
@@ -79,7 +80,8 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[in
     # jumps does not reduce its effect.
     off = float(np.quantile(np.abs(np.delete(slip, large)), 0.99)) + float(np.std(sizes))
     wraps = Wraps(jumps + 1, period, jump, min(off, NOMINAL_SHARE * period))
-    return wraps if len(jumps) > 1 or _nominal(wraps, 1.0, count_of(angle_deg)) else None
+    at_ends = len(jumps) > 1 and float(np.ptp(angle_deg[[jumps, jumps + 1]])) <= jump + off
+    return wraps if at_ends or _nominal(wraps, 1.0, count_of(angle_deg)) else None
 
 
 def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:

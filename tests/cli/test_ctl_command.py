@@ -126,7 +126,7 @@ def test_the_lease_holder_is_named_and_can_be_overruled(ctl, machine):
     ("line", "status", "words"),
     [
         ("move joint-1 181", 2, "-180 to 180"),
-        ("move joint-1 nan", 2, "ANGLE: found 'nan'; expected a number"),
+        ("move joint-1 nan", 2, "ANGLE: found 'nan'; expected a finite number"),
         ("move joint-2 1", 7, "enable it first"),
         ("move joint-9 1", 2, "joint-1, joint-2"),
         ("move joint-1 1 2 --no-wait", 2, "queue"),

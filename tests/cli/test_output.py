@@ -48,12 +48,15 @@ def test_a_closed_standard_output_is_not_an_error(tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["axis"] == "article"
 
 
+@pytest.mark.parametrize("of_class", [False, True])
 @pytest.mark.parametrize(
     ("slow", "arguments"), [("typer", ("--help",)), ("numpy", ("step", "article", "--simulate"))]
 )
-def test_ctrl_c_during_start_up_prints_no_traceback(tmp_path, slow, arguments):
-    """An import that never ends stands for a slow one."""
-    (tmp_path / f"{slow}.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")
+def test_ctrl_c_during_start_up_prints_no_traceback(tmp_path, slow, arguments, of_class):
+    """An import, or the creation of a class in it, that never ends stands for a slow one."""
+    waits = "def wait(*_):\n import time\n print('loading', flush=True)\n time.sleep(600)\n"
+    waiting = "class C:\n it = type('Slow', (), {'__set_name__': wait})()\n" if of_class else "wait()\n"
+    (tmp_path / f"{slow}.py").write_text(waits + waiting)
     with started(Path.cwd(), *arguments, env={"PYTHONPATH": str(tmp_path)}) as process:
         assert process.stdout.readline() == "loading\n"
         process.send_signal(signal.SIGINT)

@@ -24,10 +24,21 @@ from hdbridge.records.record import Record
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 LONG = "x" * 300
-UNREADABLE = ("", "pipe", "nowhere/at/all", "circle", LONG, "junk", "empty", "/dev/zero", "/dev/null")
+UNREADABLE = (
+    "",
+    "b\udcfcro",
+    "pipe",
+    "nowhere/at/all",
+    "circle",
+    LONG,
+    "junk",
+    "empty",
+    "/dev/zero",
+    "/dev/null",
+)
 UNWRITABLE = {
-    "file": ("", "circle", LONG, "junk", "axis", "nowhere/at/all", "junk/new"),
-    "folder": ("", "circle", LONG, "junk", "axis", "junk/new", "pipe"),
+    "file": ("", "b\udcfcro", "circle", LONG, "junk", "axis", "nowhere/at/all", "junk/new"),
+    "folder": ("", "b\udcfcro", "circle", LONG, "junk", "axis", "junk/new", "pipe"),
 }
 RIGHT = {
     "PROFILE": "axis", "MACHINE": "axis", "NAME": "fresh", "RECORD": "record.csv", "RECORDING": "record.csv",
@@ -239,6 +250,14 @@ def test_a_profile_that_cannot_be_written_is_refused_before_a_measurement(place,
     assert f"axis/{pending}: cannot be written: it is a folder" in done.stderr
     assert "booted" not in done.stderr
     assert contents(place) == before
+
+
+def test_an_axis_file_that_is_a_folder_is_named_once(place):
+    (place / "axis" / "axis.yaml").unlink()
+    (place / "axis" / "axis.yaml").mkdir()
+    for profile in ("axis", "axis/axis.yaml"):
+        done = run_here(place, "check", profile, status=2)
+        assert f"{profile}: has no file axis.yaml; expected the folder of an axis" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["axis.yaml", "model.yaml", "truth.yaml"])

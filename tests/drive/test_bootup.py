@@ -56,7 +56,7 @@ def test_an_absent_drive_is_named_within_a_bounded_time(drive, slave, clock, axi
     with pytest.raises(DriveError, match=r"node 1 on virtual:test-.*no other node.*drive\.node_id") as caught:
         drive.boot()
     assert "\n" not in str(caught.value)
-    assert clock.now() < 3.0
+    assert clock.now() < 3.5
 
 
 def booting(slave: Any, clock: Any, boot_up_s: float | None, sdo_s: float) -> None:
@@ -92,7 +92,7 @@ def test_a_drive_that_boots_but_never_answers_is_reported_as_heard(drive, slave,
     with pytest.raises(DriveError, match=r"does not answer \(heard of it: its boot-up message\); ") as caught:
         drive.boot()
     assert "no other node" not in str(caught.value)
-    assert 4.0 <= clock.now() <= 5.0
+    assert 4.0 <= clock.now() <= 5.5
 
 
 def test_a_stopped_node_is_reported_as_heard(drive: Drive, slave: Any, bus: Any) -> None:

@@ -13,7 +13,7 @@ from hdbridge.control.bench import Bench
 from hdbridge.drive import Drive, Mode
 from hdbridge.drive.sdo import SdoAbortError
 from hdbridge.drive.states import State
-from hdbridge.errors import DriveError, SdoError, TransitionError
+from hdbridge.errors import DriveError, SafetyStop, SdoError, TransitionError
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import VirtualClock
 
@@ -121,6 +121,64 @@ def test_homing_is_over_only_if_the_drive_shows_its_start(method: int, counts: i
             with pytest.raises(TransitionError, match="the start of homing by method"):
                 drive.home(method)
             assert node.state != ENABLED
+
+
+def test_a_move_is_over_only_where_it_ends() -> None:
+    """The drive reports its target as reached and stands still."""
+    with booted() as (drive, _):
+        drive.move_to(0.0)
+    with booted() as (drive, node):
+        with pytest.raises(TransitionError, match="arrival at 5 deg did not occur"):
+            drive.move_to(5.0)
+        assert node.state != ENABLED
+
+
+def test_a_drive_that_restarts_under_power_is_switched_off_first() -> None:
+    with booted() as (drive, node):
+        drive.enable(Mode.PP)
+        node.ways = Ways(keeps_power=True, starts_itself=True)
+        resets: list[int] = []
+        restart = node.restart
+
+        def reset(**how: bool) -> None:
+            resets.append(node.state)
+            restart(**how)
+
+        node.restart = reset  # type: ignore[method-assign]
+        drive.boot()
+        assert resets == [OFF]
+
+
+@pytest.mark.parametrize("recovers", [False, True])
+@pytest.mark.parametrize("frame", [0x080, 0x201, 0x77F])
+def test_bus_off_on_the_bench_leaves_no_motion(frame: int, recovers: bool) -> None:
+    axis, channel, clock = article_axis(1), str(uuid4()), VirtualClock()
+    node = RudeDrive(channel, axis, clock)
+    clock.nodes.append(node)
+    with SpoiltBus(channel, clock) as bus:
+        bus.private, bus.channel_info = True, "socketcan channel 'can0'"
+
+        def interrupted() -> bool:
+            if node.motor_counts > 1000 and bus.unsent is None:
+                bus.bus_off_at = frame
+            return False
+
+        def step() -> None:
+            with Drive(bus, axis, clock) as drive:
+                drive.boot()
+                Bench(drive, interrupted=interrupted).run(Stepping(count=4, step_deg=400.0))
+
+        with pytest.raises(SafetyStop, match="bus-off"):
+            step()
+        if recovers:
+            bus.recover()
+        clock.sleep_until(clock.now() + 0.5)
+        stopped = node.motor_counts
+        clock.sleep_until(clock.now() + 0.5)
+        assert node.motor_counts == stopped > 1000
+        assert node.state != ENABLED
+        assert node.powered == 1
+    node.close()
 
 
 def test_a_drive_that_is_not_enabled_in_time_has_no_power_on_the_bench() -> None:

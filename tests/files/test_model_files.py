@@ -66,7 +66,7 @@ def axis(tmp_path) -> AxisConfig:
         ("width_deg: 20, ", "", "9:17: effects[1].parameters: key 'width_deg' is missing; expected {width_deg}"),
         ("exponent: 1.6", "exponent: 1", "9:62: effects[1].parameters.exponent: found 1; expected {exponent}"),
         ("offset_arcsec: 40", "offset_arcsec: forty", "9:33: effects[1].parameters.offset_arcsec: found 'forty'; expected {offset_arcsec}"),
-        ("offset_arcsec: 40", "offset_arcsec: .nan", "9:33: effects[1].parameters.offset_arcsec: found .nan; expected {offset_arcsec}"),
+        ("offset_arcsec: 40", "offset_arcsec: .nan", "9:33: effects[1].parameters.offset_arcsec: found .nan; expected a finite number from -3600 to 3600 (half the height of the loop, at the load; negative if the load lags)"),
         ("order: 1,", "order: 1.5,", "7:19: effects[0].parameters.orders[0].order: found 1.5; expected {order}"),
         ("amplitude_arcsec", "amplitude_arcmin", "7:22: effects[0].parameters.orders[0].amplitude_arcmin: unknown key; did you mean 'amplitude_arcsec'?"),
         ("-126.8}", "-126.8}\n        - {order: 1, amplitude_arcsec: 1, phase_deg: 0}", "7:9: effects[0].parameters.orders: each order may appear only once"),

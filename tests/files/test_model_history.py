@@ -146,6 +146,13 @@ def test_another_drive_axis_or_gear_is_refused_and_nothing_changes(profile):
     assert offset(profile) == 41
 
 
+def test_a_pending_version_that_cannot_be_deleted_is_reported(profile):
+    """As on a read-only disk; here it is a folder."""
+    (profile / "pending.yaml").mkdir()
+    with pytest.raises(InputError, match=r"pending\.yaml: .*; nothing was deleted$"):
+        store.discard(profile)
+
+
 def test_missing_versions_are_reported(profile):
     with pytest.raises(InputError, match=r": there is no pending model; calibrate first$"):
         store.commit(profile, DATE)

@@ -46,7 +46,7 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
         (f"{HEAD}\n0,1,2\n1,1_0,2\n".encode(), ":3: motor_position_deg: '1_0' is not a number; expected a number"),
         (f"{HEAD}\n0,1,2\n\n1,1,nan\n".encode(), ":4: load_position_deg: nan; expected a finite number"),
         (f"{HEAD}\n0,1,2\n1,1,-inf\n".encode(), ":3: load_position_deg: -inf; expected a finite number"),
-        (f'{HEAD}\n0,1,2\n\n1,"1,2\n2,1,2\n'.encode(), ":4: 2 values; expected 3, one for each column"),
+        (f'{HEAD}\n0,1,2\n\n1,"1,2\n2,1,2\n'.encode(), ":4: not CSV: unexpected end of data; expected quotes in pairs"),
         (f'{HEAD}\n0,1,2\n\n1,"1,2\n{"2,1,2{nl}" * 30000}'.replace("{nl}", chr(10)).encode(), ":4: not CSV: field larger than field limit (131072); expected quotes in pairs"),
         (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,nan\n".encode(), ":3: temperature_c: nan; expected a finite number"),
         (f"{HEAD},temperature_c\n0,1,2,20\n1,1,2,\n".encode(), ":3: temperature_c: no value; expected a number"),

@@ -74,7 +74,7 @@ HEAD = "schema: test.thing/1\nnode_id: 1\n"
         (HEAD + "parts:\n  - colour: red\n", "4:5: parts[0]: key 'width_mm' is missing; expected a number above 0, at most 10 (its width)"),
         (HEAD + "parts:\n  - {width_mm: 1, colour: bleu}\n", "4:27: parts[0].colour: found 'bleu'; expected 'red' or 'blue'; did you mean 'blue'?"),
         (HEAD + "big: {width_mm: 11}\n", "3:17: big.width_mm: found 11; expected a number above 0, at most 10 (its width)"),
-        (HEAD + "big: {width_mm: .nan}\n", "3:17: big.width_mm: found .nan; expected a number above 0, at most 10 (its width)"),
+        (HEAD + "big: {width_mm: .nan}\n", "3:17: big.width_mm: found .nan; expected a finite number above 0, at most 10 (its width)"),
         (HEAD + "big: {width_mm: 0.5}\n", "3:17: big.width_mm: a big {part} is at least 1 mm wide"),
         (HEAD + "big: [1]\n", "3:6: big: found a list; expected a mapping"),
         (HEAD + "sizes: [1, -2]\n", "3:12: sizes[1]: found -2; expected an integer of at least 0"),
@@ -107,6 +107,14 @@ def test_a_wrong_file_gets_one_line_that_says_where_and_why(tmp_path, text, expe
     with pytest.raises(InputError) as caught:
         load_yaml(path, Thing)
     assert str(caught.value) == f"{path}:{expected}"
+
+
+@pytest.mark.parametrize("opening", ["[", "{", "- ", "? ", "a: [", "{a: "])
+def test_a_file_that_is_nested_without_end_is_refused_where_it_is_too_deep(tmp_path, opening):
+    path = tmp_path / "thing.yaml"
+    path.write_text(opening * 5000)
+    with pytest.raises(InputError, match=rf"^{path}:1:\d+: nested deeper than 32 levels$"):
+        load_yaml(path, Thing)
 
 
 def test_several_errors_are_listed_in_file_order_and_counted(tmp_path):

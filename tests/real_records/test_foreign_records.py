@@ -1,6 +1,7 @@
 """CSV files of other benches: dialects, columns, units and wrapped counters; one line for each error."""
 
 import gzip
+import itertools
 import math
 from contextlib import nullcontext
 from pathlib import Path
@@ -43,6 +44,17 @@ WRONG = {
     "time that stands": (text(time=0.0 * TIME), ": time_s: 0 in all 200 rows; expected increasing times"),
     "another gear": (text(motor=1.02 * MOTOR), "the motor makes 51.001 turns per turn of the load"),
     "a load that stands": (text(load=0.0 * LOAD), "the load stands still while the motor turns"),
+    **{
+        f"an open quote before {name}": (
+            text().replace(name, f'"{name}'),
+            ":1: a quote is not closed; expected",
+        )
+        for name in ("time_s", "motor_position_deg", "load_position_deg")
+    },
+    "an open quote in a row": (
+        text().replace("0.500000000,", '"0.5,'),
+        ":52: not CSV: unexpected end of data",
+    ),
     "no motion": (text(motor=0.0 * MOTOR, load=0.0 * LOAD), ": the motor never moves in 200 samples"),
     "few samples": ("".join(text().splitlines(keepends=True)[:21]), "20 "),
 }
@@ -322,6 +334,17 @@ def test_a_single_jump_is_not_a_counter_wrap(jump_deg: float) -> None:
     slow = np.round(MOTOR / 10.0, 8)
     slipped = np.where(np.arange(COUNT) > 100, slow + jump_deg, slow)
     assert find_wraps(slipped, slow / RATIO) is None
+
+
+@pytest.mark.parametrize("losses", list(itertools.product([-47.3, 47.3], repeat=2)))
+@pytest.mark.parametrize("there_and_back", [False, True])
+def test_lost_counts_of_equal_size_are_not_counter_wraps(
+    losses: tuple[float, float], there_and_back: bool
+) -> None:
+    true = np.round(np.concatenate([MOTOR, MOTOR[::-1]] if there_and_back else [MOTOR]) / 10.0, 8)
+    rows = np.arange(len(true))
+    lost = losses[0] * (rows > 70) + losses[1] * (rows > len(rows) - 40)
+    assert find_wraps(true + lost, true / RATIO) is None
 
 
 @pytest.mark.parametrize("samples", [1, 2])

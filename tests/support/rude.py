@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from types import SimpleNamespace
 
 import can
@@ -46,6 +47,16 @@ class Ways:
     """Sends no heartbeat."""
     mode_delay_s: float = 0.0
     boot_delay_s: float = 0.0
+    boots_again_s: float = 0.0
+    """Time after which it repeats its boot-up message; 0 if it does not."""
+    loses_turns: int = 0
+    """Motor turns by which its position is wrong after a restart."""
+    sdo_delay_s: float = 0.0
+    """Age of its SDO answers."""
+    tpdo_again_s: float = 0.0
+    """Time after which it sends its TPDOs a second time in each cycle, with new values; 0 if it does not."""
+    runs_on: bool = False
+    """Keeps its speed in modes without cyclic set-points."""
     stale_tpdos: int = 0
     """Number of SYNCs after a restart that it answers with its last TPDO."""
     status_delay: int = 0
@@ -75,6 +86,8 @@ class RudeDrive:
         self._per_turn, self._load_per_motor = motor, load / axis.gear.ratio / motor
         self.motor_counts = 0
         self.state, self.nmt = OFF, 127
+        self.claims_arrival = False
+        """True from its first set-point in PP on; it does not move in PP."""
         self.powered = 0
         """Number of times that it entered *operation enabled*."""
         self.moved_s = 0.0
@@ -96,7 +109,9 @@ class RudeDrive:
         self._kept = dict(self._values)
         self._rpdo: bytes | None = None
         self._speed = 0
-        self._events: list[tuple[float, str, int]] = []
+        self._events: list[tuple[float, Callable[[], None]]] = []
+        self._booting = False
+        self._zero = 0
         self._beat_s = self._heal_s = float("inf")
         self._heard_s: float | None = None
         self._words: deque[int] = deque(maxlen=64)
@@ -127,10 +142,7 @@ class RudeDrive:
                 self._take(message.arbitration_id, bytes(message.data), now_s)
         for event in [each for each in self._events if each[0] <= now_s]:
             self._events.remove(event)
-            if event[1] == "boot":
-                self._booted(now_s)
-            else:
-                self._values[0x6061, 0] = event[2]
+            event[1]()
         if now_s >= self._heal_s:
             self._heal_s = float("inf")
             if self.state == FAULT:
@@ -149,7 +161,7 @@ class RudeDrive:
         self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def _take(self, can_id: int, data: bytes, now_s: float) -> None:
-        if any(each[1] == "boot" for each in self._events):
+        if self._booting:
             return
         if can_id == 0x000 and len(data) == 2 and data[1] in (0, self.node_id):
             if data[0] in (0x81, 0x82):
@@ -175,7 +187,8 @@ class RudeDrive:
             self._values = dict(self._kept)
         self._heard_s, self._beat_s, self.nmt = None, float("inf"), 0
         self._values[0x1016, 1] = self._values[0x1017, 0] = 0
-        self._events = [(self._clock.now() + self.ways.boot_delay_s, "boot", 0)]
+        self._events, self._booting = [], True
+        self._after(self.ways.boot_delay_s, self._booted)
 
     def configure(self, tpdos: Iterable[Layout]) -> None:
         """Makes it OPERATIONAL in CSP with these PDOs, as if a master had booted it."""
@@ -188,9 +201,19 @@ class RudeDrive:
             for sub, entry in enumerate(entries, 1):
                 self._values[0x1A00 + place, sub] = entry.mapping
 
-    def _booted(self, now_s: float) -> None:
-        self.nmt = 5 if self.ways.starts_itself else 127
+    def _booted(self) -> None:
+        self.nmt, self._booting = 5 if self.ways.starts_itself else 127, False
+        self._zero = self.ways.loses_turns * self._per_turn
         self._send(0x700 + self.node_id, b"\0")
+        if self.ways.boots_again_s:
+            self._after(self.ways.boots_again_s, lambda: self._send(0x700 + self.node_id, b"\0"))
+
+    def _after(self, delay_s: float, happens: Callable[[], None]) -> None:
+        self._events.append((self._clock.now() + delay_s, happens))
+
+    def swap_mode(self, mode: int) -> None:
+        """Changes the mode of operation, which nobody requested."""
+        self._values[0x6061, 0] = mode
 
     def boot_up(self) -> None:
         self.restart()
@@ -227,10 +250,13 @@ class RudeDrive:
         if self[0x6061, 0] == 8:
             return word | (0x1000 if self.state == ENABLED else 0)
         done = self.ways.reached
+        if done is None and self[0x6061, 0] == 1:
+            return word | (0x1000 if self[0x6040, 0] & 0x10 else 0x400 * self.claims_arrival)
         return word | (0x1400 if done is None and self.state == ENABLED else done or 0)
 
     def _control(self, word: int) -> None:
         before, state = self._values[0x6040, 0], self.state
+        self.claims_arrival |= bool(word & 0x10)
         self._values[0x6040, 0] = word
         if state == FAULT:
             if word & 0x80 and not before & 0x80:
@@ -279,6 +305,12 @@ class RudeDrive:
             frames, self._held = [], frames
         for frame in frames:
             self._send(*frame)
+        if self.ways.tpdo_again_s:
+            self._after(self.ways.tpdo_again_s, self._send_again)
+
+    def _send_again(self) -> None:
+        for frame in self._tpdos():
+            self._send(*frame)
 
     def _count(self, fault: str) -> bool:
         left: int = getattr(self, fault)
@@ -286,11 +318,12 @@ class RudeDrive:
         return left > 0
 
     def _move(self) -> None:
-        if self.state != ENABLED or self[0x6061, 0] != 8:
+        cyclic = self[0x6061, 0] == 8
+        if self.state != ENABLED or not (cyclic or self.ways.runs_on):
             return
-        if not (self.ways.coasts and not self[0x6040, 0] & 0x04):
+        if cyclic and not (self.ways.coasts and not self[0x6040, 0] & 0x04):
             most = self._per_turn // 4
-            self._speed = max(-most, min(most, self[0x607A, 0] - self.motor_counts))
+            self._speed = max(-most, min(most, self[0x607A, 0] - self._zero - self.motor_counts))
         self.motor_counts += self._speed
         if self._speed:
             self.moved_s = self._clock.now()
@@ -316,12 +349,13 @@ class RudeDrive:
 
     def _live(self) -> dict[int, int]:
         """Values that the drive measures, by index."""
-        demand = self[0x607A, 0] if self.state == ENABLED else self.motor_counts
+        shown = self.motor_counts + self._zero
+        demand = self[0x607A, 0] if self.state == ENABLED else shown
         load = round(self.motor_counts * self._load_per_motor) + self.load_jump_counts
         return {
             0x6041: self.statusword(),
             0x6062: demand,
-            0x6064: self.motor_counts,
+            0x6064: shown,
             0x6077: 0,
             0x60E4: load,
         }
@@ -368,7 +402,10 @@ class RudeDrive:
         abort = struct.pack("<B3sI", 0x80, answer[1:4], 0x08000000)
         frames = {"twice": [answer, answer], "before": [before, answer], "abort": [abort]}.get(way, [answer])
         for frame in filter(None, frames):
-            self._send(0x580 + self.node_id, frame)
+            if self.ways.sdo_delay_s:
+                self._after(self.ways.sdo_delay_s, partial(self._send, 0x580 + self.node_id, frame))
+            else:
+                self._send(0x580 + self.node_id, frame)
 
     def _write(self, key: tuple[int, int], value: int, now_s: float) -> None:
         if key == (0x6040, 0):
@@ -376,7 +413,7 @@ class RudeDrive:
             return
         self._values[key] = value
         if key == (0x6060, 0):
-            self._events.append((now_s + self.ways.mode_delay_s, "mode", value))
+            self._after(self.ways.mode_delay_s, lambda: self.swap_mode(value))
         elif key == (0x1017, 0):
             self._beat_s = now_s + value / 1e3 if value and not self.ways.guards else float("inf")
         elif key == (0x1016, 1):

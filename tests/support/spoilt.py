@@ -19,7 +19,18 @@ class Spoilt(can.BusABC):
     """Identifier of a frame for which the transmit queue is full once."""
     full = False
     """True while the transmit queue is full."""
+    bus_off_at: int | None = None
+    """Identifier of a frame whose transmission makes the controller go bus-off."""
+    unsent: list[can.Message] | None = None
+    """Frames in the transmit queue while the controller is bus-off; else None."""
     spy: Callable[[int, bytes], None] | None = None
+    _reports_bus_off = False
+
+    def recover(self) -> None:
+        """Ends bus-off; the queued frames are sent."""
+        unsent, self.unsent = self.unsent or [], None
+        for each in unsent:
+            self.send(each)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._check()
@@ -28,11 +39,22 @@ class Spoilt(can.BusABC):
             raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
         if self.spy is not None:
             self.spy(msg.arbitration_id, bytes(msg.data))
+        if self.unsent is not None:
+            self.unsent.append(msg)
+            return
+        if msg.arbitration_id == self.bus_off_at:
+            self.bus_off_at, self.unsent = None, []
+            self._reports_bus_off = True
+            return
         super().send(msg, timeout)  # type: ignore[safe-super]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         self._check()
-        return super().recv(timeout)
+        if self._reports_bus_off:
+            self._reports_bus_off = False
+            return can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False)
+        message = super().recv(timeout)
+        return message if self.unsent is None else None
 
     def _check(self) -> None:
         if self.down is not None:

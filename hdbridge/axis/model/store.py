@@ -204,7 +204,11 @@ class Store(Generic[K]):
         with _locked(profile):
             try:
                 (profile / self.pending).unlink()
-            except FileNotFoundError:
+            except OSError as problem:
+                if (profile / self.pending).exists():
+                    raise InputError(
+                        f"{profile / self.pending}: {problem.strerror}; nothing was deleted"
+                    ) from None
                 raise InputError(f"{profile}: there is no pending {self.noun}") from None
 
     def activate(

@@ -24,11 +24,10 @@ from hdbridge.control.bench import axis_view
 from hdbridge.control.runner import AxisRunner
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.feedback import STOP_TIMEOUT_S, Feedback
+from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
 from hdbridge.drive.objects import COB_EMCY
-from hdbridge.drive.standstill import Standstill
 from hdbridge.drive.states import FAULTS, State, decode
 from hdbridge.drive.supervision import Event
 from hdbridge.errors import SafetyStop
@@ -218,7 +217,7 @@ class SlowAxis(AxisRunner):
         states = [decode(each.statusword) for each in self.cycle.stop_feedbacks] if event is not None else []
         if event is None:
             self.stop()
-        silence = self._after_silence(start.motor_counts, noticed_s, event, self._pause)
+        silence = self._after_silence(start.motor_counts, noticed_s, event)
         said = self._drive.monitor.nodes[self.axis.drive.node_id].emergencies
         return speed, replace(
             silence,
@@ -241,7 +240,7 @@ class SlowAxis(AxisRunner):
                 break
         if noticed_s is None:
             drive.quick_stop()
-        result = self._after_silence(start.motor_counts, noticed_s, None, drive.wait)
+        result = self._after_silence(start.motor_counts, noticed_s, None)
         self.image.power.observe(result.statusword)
         return speed, result
 
@@ -260,29 +259,12 @@ class SlowAxis(AxisRunner):
         counts, time_s = late[-1].motor_counts - late[0].motor_counts, late[-1].time_s - late[0].time_s
         return abs(self.axis.motor_encoder.degrees(counts)) / time_s if time_s else 0.0
 
-    def _pause(self, duration_s: float) -> None:
-        self.link.clock.sleep_until(self.link.now() + duration_s)
-
-    def _after_silence(
-        self, start_counts: int, noticed_s: float | None, event: Event | None, pause: Callable[[float], None]
-    ) -> Silence:
+    def _after_silence(self, start_counts: int, noticed_s: float | None, event: Event | None) -> Silence:
         """Waits for standstill, and reads the position by SDO, because the drive may no longer send PDOs."""
-        sdo, clock = self._drive.sdo, self.link.clock
-        standstill = Standstill(self.axis)
-        end_s = clock.now() + STOP_TIMEOUT_S
-        while True:
-            last = sdo.fetch(objects.POSITION_ACTUAL)
-            if standstill.take(last, clock.now()) or clock.now() >= end_s:
-                break
-            pause(0.05)
-        way = wrap_int32(last - wrap_int32(start_counts))
-        return Silence(
-            noticed_s,
-            event,
-            sdo.fetch(objects.STATUSWORD),
-            standstill.reached,
-            abs(self.axis.motor_encoder.degrees(way)),
-        )
+        stands, sdo = self._drive.wait_for_standstill(), self._drive.sdo
+        way = wrap_int32(sdo.fetch(objects.POSITION_ACTUAL) - wrap_int32(start_counts))
+        statusword, distance_deg = sdo.fetch(objects.STATUSWORD), abs(self.axis.motor_encoder.degrees(way))
+        return Silence(noticed_s, event, statusword, stands, distance_deg)
 
 
 Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Clock]]]

@@ -6,7 +6,8 @@
 import errno
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 
 import can
 import pytest
@@ -15,13 +16,17 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from support.characters import RUDE
 from support.daemon import SteppedDaemon, article_axis, stepped_daemon
-from support.rude import ENABLED, OFF, STOPPED, RudeDrive
+from support.rude import ENABLED, OFF, STOPPED, RudeDrive, Ways
+from support.spoilt import SpoiltBus
 
 from hdbridge.axis import Source
+from hdbridge.control.bench import Bench
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
+from hdbridge.drive import Drive
 from hdbridge.drive.supervision import Fault
+from hdbridge.motion.procedures.stepping import Stepping
 
 AFTER_TURNS = st.integers(0, 8)
 """Cycles from the command to enable until a drive is enabled, and some more."""
@@ -142,6 +147,7 @@ HARMLESS: dict[str, Disturbance] = {
     "emergency storm": lambda daemon, _: emergencies(daemon, 200),
     "end of all errors": lambda daemon, _: daemon.interfere(0x081, bytes(8)),
     "each TPDO twice": lambda _, node: setattr(node, "duplicate_tpdos", 200),
+    "TPDOs at twice the rate": lambda _, node: setattr(node.ways, "tpdo_again_s", 0.002),
     "a late TPDO": lambda _, node: setattr(node, "hold_tpdos", 1),
     "a lost TPDO": lambda _, node: setattr(node, "drop_tpdos", 1),
     "jumps by the range of 6064h": lambda _, node: node.ways.jumps.extend([1 << 32, 0, -(1 << 32)]),
@@ -154,6 +160,12 @@ STOPPING: dict[str, Disturbance] = {
     "pre-operational": lambda _, node: node.leave_operational(),
     "restart": lambda _, node: node.restart(),
     "restart with power": lambda _, node: restarts(node),
+    "another mode": lambda _, node: node.swap_mode(1),
+    "another mode for a while": lambda daemon, node: (
+        node.swap_mode(1),
+        daemon.run(0.1),
+        node.swap_mode(8),
+    ),
     "no TPDO any more": lambda _, node: setattr(node, "drop_tpdos", 10**6),
     "late TPDOs": lambda _, node: setattr(node, "hold_tpdos", 3),
     "jump by half the range of 6064h": lambda _, node: node.ways.jumps.append(1 << 31),
@@ -193,6 +205,18 @@ def test_what_stops_a_move_stops_it_for_good(name: str) -> None:
         assert event.text
 
 
+def test_a_drive_that_runs_on_in_another_mode_is_stopped() -> None:
+    with moving() as (daemon, node):
+        node.ways.runs_on = True
+        node.swap_mode(3)
+        daemon.post(CommandKind.STOP)
+        daemon.run(0.5)
+        stopped = node.motor_counts
+        daemon.run(0.5)
+        assert node.motor_counts == stopped
+        assert daemon.states == [AxisState.QUICK_STOPPED]
+
+
 @pytest.mark.parametrize("frames", [300, 600])
 def test_a_flood_of_emergencies_stops_a_move(frames: int) -> None:
     with moving() as (daemon, node):
@@ -204,27 +228,88 @@ def test_a_flood_of_emergencies_stops_a_move(frames: int) -> None:
         assert node.state != ENABLED
 
 
-def test_bus_off_stops_a_move() -> None:
-    """Its only sign is an error frame of SocketCAN."""
+WAYS: dict[str, Ways] = {
+    "polite": Ways(),
+    "resumes": Ways(resumes=True),
+    "restarts by itself": Ways(keeps_power=True, starts_itself=True, resumes=True),
+    "coasts": Ways(ignores_quick_stop=True, coasts=True),
+    "sends twice": Ways(tpdo_again_s=0.002, boots_again_s=0.05),
+    "is late": Ways(sdo_delay_s=0.05, mode_delay_s=0.1, status_delay=3),
+    "loses a turn": Ways(loses_turns=1),
+}
+
+
+@pytest.mark.parametrize("recovers_s", [0.0, 0.3])
+@pytest.mark.parametrize("frame", [0x080, 0x201, 0x77F])
+@pytest.mark.parametrize("ways", WAYS.values(), ids=WAYS)
+def test_bus_off_stops_a_move_for_good(ways: Ways, frame: int, recovers_s: float) -> None:
+    """Its only sign is an error frame of SocketCAN. The queued frames are sent when it ends."""
     with stepped_daemon(1, character=RUDE) as daemon:
         daemon.bus.channel_info = "socketcan channel 'vcan0'"
         daemon.begin_again()
+        (node,) = daemon.nodes
+        assert isinstance(node, RudeDrive)
+        node.ways = replace(ways)
         daemon.verify()
         daemon.enable()
         daemon.move(300.0)
         daemon.run(0.5)
-        (node,) = daemon.nodes
+        daemon.bus.bus_off_at = frame
+        daemon.until(lambda: daemon.bus.unsent is not None)
         before = node.motor_counts
-        error_frames(daemon, 1)
+        daemon.run(0.02 + recovers_s)
+        daemon.bus.recover()
+        stopped = node.motor_counts
         daemon.run(1.0)
-        assert [
-            each.kind for each in daemon.events if each.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP)
-        ] == [
-            EventKind.BUS_DOWN,
-            EventKind.BUS_UP,
-        ]
-        assert node.motor_counts == before
+        kinds = [each.kind for each in daemon.events if each.kind in (EventKind.BUS_DOWN, EventKind.BUS_UP)]
+        assert kinds == [EventKind.BUS_DOWN, EventKind.BUS_UP]
+        assert abs(stopped - before) <= 2 * CYCLE_COUNTS
+        assert node.motor_counts == stopped
+        assert node.powered == 1
         assert daemon.states == [AxisState.LATCHED]
+
+
+class KilledError(BaseException):
+    """End of a process that sends nothing any more."""
+
+
+def borrow(daemon: SteppedDaemon, frames: int) -> None:
+    """Steps the axis with another program, which dies after this number of frames."""
+    with SpoiltBus(daemon.bus._inner.channel_id, daemon.clock) as bus:
+        left = iter(range(frames))
+
+        def spy(_can_id: int, _data: bytes) -> None:
+            if next(left, None) is None:
+                bus.unsent = []
+                raise KilledError
+
+        bus.spy = spy
+        drive = Drive(bus, daemon.axes[0].config, daemon.clock)
+        with suppress(KilledError):
+            drive.boot()
+            Bench(drive).run(Stepping(count=4, step_deg=40.0, start_deg=10.0))
+
+
+@pytest.mark.parametrize("ways", WAYS.values(), ids=WAYS)
+@settings(max_examples=8, phases=[Phase.generate])
+@given(frames=st.integers(0, 900))
+def test_a_killed_borrower_of_the_bus_leaves_no_motion(ways: Ways, frames: int) -> None:
+    with stepped_daemon(1, character=RUDE) as daemon:
+        (node,) = daemon.nodes
+        assert isinstance(node, RudeDrive)
+        daemon.turn()
+        node.ways = replace(ways, boots_again_s=0.0)
+        borrow(daemon, frames)
+        node.ways = replace(ways)
+        daemon.hang(0.5)
+        powered, stopped = node.powered, node.motor_counts
+        daemon.begin_again()
+        daemon.run(0.5)
+        daemon.verify()
+        daemon.run(0.1)
+        assert node.powered == powered
+        assert node.motor_counts == stopped
+        assert node.state == OFF
 
 
 @pytest.mark.parametrize("resumes", [False, True])
