@@ -665,9 +665,11 @@ at most 1.8."""
 HOPELESS_RATIO: Final = 30.0
 """Ratio of the mean square of the residuals after a halving to the largest near the noise, above which no
 spring and no lag is fitted any further, because the servo has a different structure."""
+MOST_RELATIVE_ERROR: Final = 0.1
+"""Maximum relative standard error of load inertia and spring from regressions for holding them."""
 MOST_OFF: Final = 0.25
-"""Maximum difference of load inertia and spring from their regressions, as logarithm, near the noise. The
-regressions were at most 0.2 off on 17 axes (`hdbridge.twin.mechanics`)."""
+"""Maximum difference of a fit near the noise from held values, as logarithm. Such values were at most 0.2 off
+on 22 axes (`hdbridge.twin.mechanics`)."""
 MAX_MISFIT_RATIO: Final = 0.97
 """Maximum ratio of the misfits with and without a block or a measured response for keeping it; a superfluous
 one gains less."""
@@ -1093,7 +1095,11 @@ def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
 def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -> Fitted:
     data, few = replays.data, replays.rough
     measured, noise = measured_mechanics(data), expected(few.data)
-    held = tuple(each for each in named(*HELD) if each.name in measured)
+    held = tuple(
+        each
+        for each in named(*HELD)
+        if each.name in measured and measured[each.name].relative <= MOST_RELATIVE_ERROR
+    )
     begun = start_of(data.base, data, measured)
     parameters = free_parameters(begun)
     progress(0.05)
