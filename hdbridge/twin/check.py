@@ -29,7 +29,8 @@ NOTICEABLE = 2.5
 """Change of a parameter that a recording must reveal, in units of the parameter's least change. If the
 recording does not reveal it, the parameter's cause is reported as not observable."""
 Z_SCORE = 3.0
-"""Minimum change of a measured parameter, in standard errors, and maximum that cannot be excluded."""
+"""Number of standard errors by which a measured change must differ from zero to count as a change, or from a
+noticeable change to count as none."""
 WARMTH = "temperature"
 OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
 """Parameters that a check fits in addition to those fitted for a twin. The temperature is left out if both

@@ -1122,9 +1122,9 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     progress(0.2)
     if not near(best):
         # With free mechanics, a wrong servo may distort them and win.
-        begun_all = [(begun, parameters), *starts(begun, 1e3 * data.pieces[0].commands.cycle_s)]
-        others = [(there, tuple(each for each in own if each not in held)) for there, own in begun_all]
-        best = _wider(in_best_structure(few, others, keep), held)
+        others = [(begun, parameters), *starts(begun, 1e3 * data.pieces[0].commands.cycle_s)]
+        without = [(there, tuple(each for each in own if each not in held)) for there, own in others]
+        best = _wider(in_best_structure(few, without, keep), held)
     progress(0.5)
     polished, in_motion = None, noise_in_motion(data)
     while near(best):

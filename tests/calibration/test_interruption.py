@@ -21,7 +21,7 @@ validation: {count: 4, cycles: 0}
 
 
 def begun(cell, *arguments):
-    """Starts a calibration; returns its process once the third task, which is long, is running."""
+    """Starts a calibration; returns its process once the third task, which is long, begins."""
     (cell.folder / "long.yaml").write_text(LONG)
     process = started(
         cell.folder, "calibrate", "axis", "--simulate", "--plan", "long.yaml", "--out", "rec", *arguments
@@ -43,9 +43,10 @@ def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell):
     assert process.returncode == 130, err
     assert "--resume rec" in err
     assert "Traceback" not in err
-    assert tasks(cell) == {("01-standstill", True, 1), ("02-sines", True, 1), ("03-sweep", False, 1)}
+    # A signal before the first sample of the sweep leaves no record of it.
+    assert tasks(cell) - {("03-sweep", False, 1)} == {("01-standstill", True, 1), ("02-sines", True, 1)}
     kept = Recording.load(cell.folder / "rec")
-    assert kept.segments[-1].kind in {"sweep", "move", "precondition", "reference"}
+    assert kept.segments[-1].kind in {"sine", "sweep", "move", "precondition", "reference"}
     first = (cell.folder / "rec" / "01-standstill.csv.gz").read_bytes()
 
     done = cell.calibrate("--resume", "rec", "--json", "result.json")

@@ -51,7 +51,7 @@ def test_a_valid_file_gives_nested_values_and_defaults(folder):
         ("cycle_ms: 4", "cycle_ms: 40", "5:3: drive: a heartbeat of 50 ms is too short for a cycle of 40 ms; expected heartbeat_ms of at least 80"),
         ("limits:", "realtime: {cpus: [3, 2, 3]}\nlimits:", "15:25: realtime.cpus[2]: processor 3 appears twice; expected it once"),
         ("cycle_ms: 4", "master_node_id: 1\n  cycle_ms: 4", "8:19: drive.master_node_id: node 1 is the drive (drive.node_id); expected another"),
-        ("counts_per_turn: 8000", "counts_per_turn: 8000.0", "11:34: motor_encoder.counts_per_turn: found 8000.0; expected an integer from 1 to 2147483647 (counts per turn of its shaft, after multiplication)"),
+        ("counts_per_turn: 8000", "counts_per_turn: 8000.0", "11:34: motor_encoder.counts_per_turn: found 8000.0; expected an integer from 1 to 2147483647 (counts per turn of the encoder's shaft, after multiplication)"),
         ("direction: -1", "source: {node: 1}", "12:57: load_encoder.source.node: node 1 is drive.node_id; expected another, or no key if the drive sends the reading"),
         ("direction: -1", "source: {node: 127}", "12:57: load_encoder.source.node: node 127 is drive.master_node_id; expected another, or no key if the drive sends the reading"),
         ("direction: -1", "source: {type: int16, range_counts: 65537}", "12:78: load_encoder.source.range_counts: int16 holds no more than 65536 counts"),

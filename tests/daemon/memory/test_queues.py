@@ -101,7 +101,7 @@ def test_a_slot_returns_only_the_setting_of_its_number(memory: Memory) -> None:
     for number in (first, 0, second + 1, -second):
         with pytest.raises(InputError, match="not in the slot"):
             slot.get(number)
-    with pytest.raises(InputError, match="takes 2000000 bytes"):
+    with pytest.raises(InputError, match="has 2000000 bytes"):
         slot.put(bytes(2_000_000))
     assert slot.get(second) == b"two"
     slot.use(second)
