@@ -61,6 +61,11 @@ def figure(value: float, digits: int = 4) -> str:
     return text.rstrip("0").rstrip(".") if decimals > 0 else text
 
 
+def rounded(value: float, digits: int = 5) -> float:
+    """Rounds a number to ``digits`` significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
     """Formats a number and the half width of its interval, which has two significant digits and determines
     the number of decimals.
@@ -70,5 +75,5 @@ def with_interval(value: float, half_width: float) -> tuple[str, str]:
     last = math.floor(math.log10(half_width)) - 1
     if 0.0 < abs(value) < 1e-4:
         return f"{value:.{max(math.floor(math.log10(abs(value))) - last, 0)}e}", f"{half_width:.1e}"
-    rounded, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
-    return rounded, half
+    middle, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
+    return middle, half

@@ -14,7 +14,7 @@ from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import CATALOGUE, Channel, Effect
 from hdbridge.axis.effects.carried import loop_of
-from hdbridge.units import DEG_PER_TURN
+from hdbridge.units import DEG_PER_TURN, rounded
 
 SAMPLES_PER_WIDTH: Final = 4
 """Minimum number of samples over the width of a loop in slow motion: one more than the number of loop
@@ -47,9 +47,9 @@ class Identifiability:
         limit = self.detection_limit_arcsec
         data: dict[str, Any] = {
             **asdict(self),
-            "detection_limit_arcsec": None if limit is None else float(f"{limit:.5g}"),
+            "detection_limit_arcsec": None if limit is None else rounded(limit),
             "aliases": list(self.aliases),
-            "share_left": float(f"{self.share_left:.3g}"),
+            "share_left": rounded(self.share_left, 3),
         }
         return {name: each for name, each in data.items() if name != "reason" or each}
 

@@ -22,7 +22,7 @@ from hdbridge.analysis.views import ResidualViews, coordinates
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, IntArray, Motion, Start
 from hdbridge.axis.effects.kinematics import direction_of
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.units import figure
+from hdbridge.units import figure, rounded
 
 _UNEXPLAINED: Final = {
     "load angle": "two slow load turns both ways, then again with the load encoder re-clocked by 90 deg",
@@ -84,7 +84,7 @@ class Figures:
 
     def as_dict(self) -> dict[str, float]:
         """Returns the JSON object."""
-        return {name: _round(each) for name, each in asdict(self).items()}
+        return {name: rounded(each) for name, each in asdict(self).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +161,11 @@ class Finding:
             "aliases": list(self.aliases),
             "parameters": {name: each.as_dict() for name, each in self.parameters.items()},
             "gain": {
-                "held_out_rms_before_arcsec": None if gain is None else _round(gain.before_arcsec),
-                "held_out_rms_after_arcsec": None if gain is None else _round(gain.after_arcsec),
+                "held_out_rms_before_arcsec": None if gain is None else rounded(gain.before_arcsec),
+                "held_out_rms_after_arcsec": None if gain is None else rounded(gain.after_arcsec),
             },
             "experiment": self.experiment,
-            "peak_arcsec": _round(self.peak_arcsec),
+            "peak_arcsec": rounded(self.peak_arcsec),
         } | {name: each for name, each in words.items() if each}
 
     @property
@@ -286,7 +286,7 @@ class Diagnosis:
             "record": self.capability.as_dict(),
             "baseline": self.baseline.as_dict(),
             "refitted": self.refitted.as_dict(),
-            "noise_floor_arcsec": _round(self.noise_floor_arcsec),
+            "noise_floor_arcsec": rounded(self.noise_floor_arcsec),
             "findings": [each.as_dict() for each in self.findings],
             "identifiability": {name: each.as_dict() for name, each in self.identifiability.items()},
             "extended": self.extended.as_dict(),
@@ -335,7 +335,3 @@ class Diagnosis:
             f"The model is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
             f"extended it is off by {self.extended.rms_arcsec:.3g}."
         )
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.5g}")

@@ -27,7 +27,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.even_speed import EvenRun
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN, rounded
 
 ComplexArray = NDArray[np.complex128]
 FloatArray = NDArray[np.float64]
@@ -285,7 +285,7 @@ def _columns(name: str, values: Iterable[complex]) -> dict[str, tuple[float, ...
     """Returns the gain and phase fields of a `Response`, with the prefix ``name``."""
     values = list(values)
     return {
-        f"{name}gain": tuple(float(f"{abs(each):.5g}") for each in values),
+        f"{name}gain": tuple(rounded(abs(each)) for each in values),
         f"{name}phase_deg": tuple(round(math.degrees(cmath.phase(each)), 2) for each in values),
     }
 

@@ -28,10 +28,10 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
-from hdbridge.axis.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
+from hdbridge.axis.effects import Channel, Effect, Moment, Start, Sum, Tracker, compensable, fall_bound
 from hdbridge.axis.effects.described import Level, Memoryless
 from hdbridge.axis.effects.motion import MEASURED
-from hdbridge.axis.model import ModelTracker, TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.prefilter import Prefilter
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
@@ -100,7 +100,7 @@ class Inverse:
         self._enter(_NOWHERE)
         trackers = [each for each, is_level in zip(trackers, level, strict=True) if not is_level]
         stateful = [keeps for keeps, is_level in zip(stateful, level, strict=True) if not is_level]
-        self._tracker: Tracker = trackers[0] if len(trackers) == 1 else ModelTracker(trackers)
+        self._tracker: Tracker = trackers[0] if len(trackers) == 1 else Sum(trackers)
         self._stateful = [each for each, keeps in zip(trackers, stateful, strict=True) if keeps]
         if self._fall > _STEEPEST_FALL * self._slope:
             raise InputError(

@@ -243,14 +243,20 @@ def _end(
         return word & bits != bits and not word & FAILED
 
     def over(word: int) -> bool:
-        if idle(word) or word & FAILED or place is None:
-            return not idle(word)
+        if idle(word):
+            return False
+        if word & FAILED or place is None:
+            return True
         return abs(commander.sdo.fetch(objects.POSITION_ACTUAL) - place[0]) <= place[1]
 
     if not idle(before):
         readings = count(1)
-        sure = FAILED | bits if place else FAILED
-        begun = lambda word: idle(word) or (next(readings) >= STALE_READINGS and word & sure and over(word))  # noqa: E731
+
+        def begun(word: int) -> bool:
+            if idle(word):
+                return True
+            return next(readings) >= STALE_READINGS and (over(word) if place else bool(word & FAILED))
+
         _wait(commander, doing, f"the start of {doing} in the statusword", begun, STEP_TIMEOUT_S)
     return _wait(commander, doing, what, over, timeout_s)
 

@@ -17,7 +17,7 @@ from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import free_parameters
-from hdbridge.twin.mechanics import COMPARED, measured_mechanics
+from hdbridge.twin.mechanics import measured_mechanics
 from hdbridge.twin.misfit import CHANNELS, Data, Replays, Values, coarse, noise_floor, prepare
 from hdbridge.twin.naming import GROWN, OF_REPLAY, Finding, explain, findings, growth, scales_by_kind, shifted
 from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
@@ -131,7 +131,7 @@ def _factors(about: Mapping[str, Any], data: Data) -> dict[str, float]:
     """
     found, now = {}, measured_mechanics(data, about.get("speed_rad_s", 0.0))
     for name, (value, error) in about.get("mechanics", {}).items():
-        if name in COMPARED and name in now:
+        if name in now:
             factor, relative = now[name].value / value, math.hypot(now[name].relative, error / value)
             size, least = abs(math.log(factor)), BY_NAME[name].least_change
             if size > max(least, Z_SCORE * relative):

@@ -28,7 +28,7 @@ from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip
 from hdbridge.sim.truth.motor import TrueObserver
-from hdbridge.twin.mechanics import HELD, Measured, measured_mechanics
+from hdbridge.twin.mechanics import HELD, Estimate, measured_mechanics
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
@@ -81,7 +81,7 @@ LATEST_S = 0.1
 """Maximum lag of the motor behind the demand, s."""
 
 
-def start_of(truth: Truth, data: Data, measured: Mapping[str, Measured]) -> Truth:
+def start_of(truth: Truth, data: Data, measured: Mapping[str, Estimate]) -> Truth:
     """Returns the truth with the ``measured`` mechanics, and with command filter and dead time from the lag
     behind the demand.
 
@@ -541,6 +541,17 @@ def continued(
     return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
 
 
+def with_parameters(fitted: Fitted, more: Sequence[Parameter], usual: Truth) -> Fitted:
+    """Returns a fit to be continued with more parameters, whose prior is about their values in ``usual``."""
+    unknown = np.zeros((len(fitted.jacobian), len(more)))
+    return replace(
+        fitted,
+        parameters=(*fitted.parameters, *more),
+        prior=np.append(fitted.prior, coordinates(usual, more)),
+        jacobian=np.concatenate([fitted.jacobian, unknown], axis=1),
+    )
+
+
 def fitted_rows(data: Data, *, everything: bool = False) -> Mask:
     """Returns the mask of the rows used in a fit, one channel after the other."""
     return np.concatenate([each if everything else each & ~data.out for each in data.counts.values()])
@@ -976,14 +987,14 @@ def with_optional_groups(replays: Replays, best: Fitted) -> Fitted:
         extra = [each for each in named(*names) if each not in best.parameters]
         if not extra or (GROWTH in names and not _warms(replays.data)):
             continue
-        wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
-        around = np.append(best.prior, coordinates(there, extra))
-        tried = solve(replays, there, wider, TRIAL_STEPS, around, known=best.scales, linear=False)
+        there = with_sections(best.truth, extra)
+        wider = with_parameters(best, extra, there)
+        tried = continued(replays, wider, TRIAL_STEPS, there, known=best.scales, linear=False)
         if best.cost - tried.cost <= MIN_LOG_LIKELIHOOD_RATIO:
             continue
         tried = continued(replays, tried, 0, known=best.scales, near=tried)
         new = len(best.parameters)
-        off = abs(float(tried.place[new] - around[new]))
+        off = abs(float(tried.place[new] - wider.prior[new]))
         if off > MIN_Z_SCORE * math.sqrt(float(tried.covariance[new, new])):
             best = tried
     return best
@@ -1031,8 +1042,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth) -> Fitted:
     without = with_values(best.truth, {LIMIT.name: highest})
     if _cost(replays, without, best) - best.cost <= MIN_LOG_LIKELIHOOD_RATIO:
         return replace(best, truth=without)
-    parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
-    return solve(replays, best.truth, parameters, STEPS, prior)
+    return continued(replays, with_parameters(best, [LIMIT], usual), STEPS)
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
@@ -1124,7 +1134,8 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
         # With free mechanics, a wrong servo may distort them and win.
         others = [(begun, parameters), *starts(begun, 1e3 * data.pieces[0].commands.cycle_s)]
         without = [(there, tuple(each for each in own if each not in held)) for there, own in others]
-        best = _wider(in_best_structure(few, without, keep), held)
+        best = in_best_structure(few, without, keep)
+        best = with_parameters(best, held, best.truth)
     progress(0.5)
     polished, in_motion = None, noise_in_motion(data)
     while near(best):
@@ -1153,18 +1164,6 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
         return polished
     rough = replace(_linearised(replays, whole), rough=True)
     return rough if polished is None else replace(rough, scatter=polished.scatter)
-
-
-def _wider(fitted: Fitted, more: tuple[Parameter, ...]) -> Fitted:
-    """Returns a start for a fit with more parameters, whose prior is about their present values."""
-    prior = np.append(fitted.prior, coordinates(fitted.truth, more))
-    unknown = np.zeros((len(fitted.jacobian), len(more)))
-    return replace(
-        fitted,
-        parameters=(*fitted.parameters, *more),
-        prior=prior,
-        jacobian=np.concatenate([fitted.jacobian, unknown], axis=1),
-    )
 
 
 def values_in(fitted: Fitted, left: Sequence[ChannelResidual]) -> Values:

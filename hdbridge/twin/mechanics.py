@@ -56,8 +56,8 @@ COMPARED: Final = (INERTIA, COULOMB, STIFFNESS)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """Value with its standard error."""
+class Estimate:
+    """Estimated value with its standard error."""
 
     value: float
     error: float
@@ -68,7 +68,7 @@ class Measured:
         return self.error / self.value
 
 
-def measured_mechanics(data: Data, speed_rad_s: float = 0.0) -> dict[str, Measured]:
+def measured_mechanics(data: Data, speed_rad_s: float = 0.0) -> dict[str, Estimate]:
     """Returns load inertia, friction, stiffness and damping by parameter name, without those that the motion
     does not show.
 
@@ -79,21 +79,20 @@ def measured_mechanics(data: Data, speed_rad_s: float = 0.0) -> dict[str, Measur
     moving = np.concatenate([each.moving for each in signals])
     if not moving.any():
         return {}
-    torque, twist = (
-        np.concatenate([getattr(each, name) for each in signals])[moving] for name in ("torque", "twist")
-    )
+    torque = np.concatenate([each.torque for each in signals])[moving]
+    twist = np.concatenate([each.twist for each in signals])[moving]
     legs = counted(data.leg[moving])
     torque[:, 3] -= speed_rad_s * torque[:, 2]
-    inertia, *friction = _regression(torque, legs)[:3]
-    found = dict(zip((INERTIA, COULOMB, VISCOUS), (inertia, *friction), strict=True))
+    inertia, coulomb, viscous, *_ = _regression(torque, legs)
+    found = {INERTIA: inertia, COULOMB: coulomb, VISCOUS: viscous}
     if _shown(inertia):
         load_nm = inertia.value * twist[:, 1] - twist[:, 2]
         compliance, decay, _ = _regression(np.column_stack([twist[:, 0], load_nm, twist[:, 3:]]), legs)
         if _shown(compliance):
             relative = math.hypot(compliance.relative, inertia.relative)
             stiffness = 1.0 / compliance.value
-            found[STIFFNESS] = Measured(stiffness, stiffness * relative)
-            found[DAMPING] = Measured(stiffness * decay.value, stiffness * decay.error)
+            found[STIFFNESS] = Estimate(stiffness, stiffness * relative)
+            found[DAMPING] = Estimate(stiffness * decay.value, stiffness * decay.error)
     return {name: each for name, each in found.items() if _shown(each)}
 
 
@@ -105,11 +104,11 @@ def rms_speed_rad_s(data: Data) -> float:
     return rms(np.concatenate(speed)[data.moving])
 
 
-def _shown(each: Measured) -> bool:
+def _shown(each: Estimate) -> bool:
     return each.value > SHOWN * each.error
 
 
-def _regression(rows: FloatArray, legs: NDArray[np.intp]) -> list[Measured]:
+def _regression(rows: FloatArray, legs: NDArray[np.intp]) -> list[Estimate]:
     """Regresses the first column on the others; the standard errors are those of independent legs."""
     wanted, columns = rows[:, 0], rows[:, 1:]
     size = np.sqrt(np.mean(np.square(columns), axis=0)) + np.finfo(np.float64).tiny
@@ -119,7 +118,7 @@ def _regression(rows: FloatArray, legs: NDArray[np.intp]) -> list[Measured]:
     left = wanted - columns @ found
     scatter = sandwich(left[:, np.newaxis] * columns, legs)
     error = np.sqrt(np.diag(inverse @ scatter @ inverse))
-    return [Measured(*each) for each in zip((found / size).tolist(), (error / size).tolist(), strict=True)]
+    return [Estimate(*each) for each in zip((found / size).tolist(), (error / size).tolist(), strict=True)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ from hdbridge.twin.replay import (
     stretches,
     unknown_rows,
 )
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.units import ARCSEC_PER_DEG, rounded
 
 # ----------------------------------------------------------------
 # Residuals between a recording and its replay, by channel, which a fit minimises.
@@ -598,13 +598,8 @@ def misfit_of(
     found: dict[str, dict[str, float]] = {}
     for name, inside in (rows or data.counts).items():
         for kind in dict.fromkeys(kinds[inside].tolist()):
-            found.setdefault(name, {})[kind] = rounded(rms(residuals[name][inside & (kinds == kind)]))
+            found.setdefault(name, {})[kind] = rounded(rms(residuals[name][inside & (kinds == kind)]), 6)
     return found
-
-
-def rounded(value: float) -> float:
-    """Rounds to six significant digits."""
-    return float(f"{value:.6g}")
 
 
 def signals_of(data: Data) -> dict[str, FloatArray]:

@@ -23,6 +23,7 @@ from hdbridge.sim.truth.motor import TrueResponse
 from hdbridge.twin.fit import MAX_MISFIT_RATIO, Fitted
 from hdbridge.twin.misfit import Data, Piece, Replays, misfit, motor_deg
 from hdbridge.twin.parameters import FOLLOWING, TORQUE
+from hdbridge.units import rounded
 
 SPEED_S: Final = 0.4
 """Length of the responses to the speed. A load that rings at 15 Hz with a damping ratio of 0.06 decays to a
@@ -109,4 +110,4 @@ def _grown(before: Sequence[float], taps: FloatArray) -> FloatArray:
 
 
 def _rounded(taps: FloatArray) -> tuple[float, ...]:
-    return tuple(float(f"{each:.5g}") for each in taps)
+    return tuple(rounded(float(each)) for each in taps)

@@ -48,7 +48,7 @@ from hdbridge.twin.fit import (
     legs_of_rows,
     values_in,
 )
-from hdbridge.twin.mechanics import measured_mechanics, rms_speed_rad_s
+from hdbridge.twin.mechanics import COMPARED, measured_mechanics, rms_speed_rad_s
 from hdbridge.twin.misfit import (
     CHANNELS,
     MOST_SCATTER,
@@ -64,7 +64,6 @@ from hdbridge.twin.misfit import (
     noise_floor,
     noise_in_motion,
     prepare,
-    rounded,
     with_load_noise,
 )
 from hdbridge.twin.naming import Finding, InseparableSet, explain, findings, inseparable_sets, scales_by_kind
@@ -72,7 +71,7 @@ from hdbridge.twin.parameters import LOAD, by_cause, default_truth, with_section
 from hdbridge.twin.replay import legs_of, replay
 from hdbridge.twin.response import with_response
 from hdbridge.twin.thermal import with_warmth
-from hdbridge.units import figure
+from hdbridge.units import figure, rounded
 
 # ----------------------------------------------------------------
 # Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals.
@@ -417,13 +416,17 @@ def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
 
 def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> Truth:
     """Returns the fitted truth with its intervals, and with the data for a later check in its provenance."""
-    intervals, speed_rad_s = fitted.intervals(), rounded(rms_speed_rad_s(data))
+    intervals, speed_rad_s = fitted.intervals(), rounded(rms_speed_rad_s(data), 6)
     measured = measured_mechanics(data, speed_rad_s)
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],
-        "noise": {name: rounded(fitted.scales.noise[name]) for name in CHANNELS},
+        "noise": {name: rounded(fitted.scales.noise[name], 6) for name in CHANNELS},
         "misfit": misfit_of(data, fitted.residuals),
-        "mechanics": {name: [rounded(each.value), rounded(each.error)] for name, each in measured.items()},
+        "mechanics": {
+            name: [rounded(each.value, 6), rounded(each.error, 6)]
+            for name, each in measured.items()
+            if name in COMPARED
+        },
         "speed_rad_s": speed_rad_s,
     }
     truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])

@@ -1,6 +1,5 @@
 """Transmission model (a gear ratio and a sum of effects), its file, history and comparison."""
 
-from hdbridge.axis.effects import Sum as ModelTracker
 from hdbridge.axis.model.transmission import TransmissionModel
 
-__all__ = ["ModelTracker", "TransmissionModel"]
+__all__ = ["TransmissionModel"]

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.commissioning.bringup.checks import Verdict, failed, judged, passed
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.units import ARCSEC_PER_DEG, rounded
 
 TOOTH_SHARE: Final = 0.35
 """Maximum error of a ratio, relative to the distance to its neighbour (N and N + 1 differ by 1/N)."""
@@ -183,9 +183,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> SuspectEntry:
         if whole in USUAL_RATIOS:
             return SuspectEntry(RATIO, found, whole, 2.0 - less, "a usual ratio")
         return SuspectEntry(RATIO, found, whole, 1.0 - less, "a whole number")
-    return SuspectEntry(
-        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is not a whole number"
-    )
+    return SuspectEntry(RATIO, found, rounded(wanted), -2.0, "it would explain it, but is not a whole number")
 
 
 def _roundest(value: float) -> int:

@@ -137,7 +137,7 @@ def error_frames(daemon: SteppedDaemon, number: int) -> None:
 
 
 def restarts(node: RudeDrive) -> None:
-    """Restarts the communication only, and goes on with the last RPDO."""
+    """Restarts only the communication, and still acts on the last RPDO."""
     node.ways.starts_itself = node.ways.keeps_power = node.ways.resumes = True
     node.restart(everything=False)
 
@@ -231,7 +231,7 @@ def test_a_flood_of_emergencies_stops_a_move(frames: int) -> None:
 WAYS: dict[str, Ways] = {
     "polite": Ways(),
     "resumes": Ways(resumes=True),
-    "restarts by itself": Ways(keeps_power=True, starts_itself=True, resumes=True),
+    "restarts on its own": Ways(keeps_power=True, starts_itself=True, resumes=True),
     "coasts": Ways(ignores_quick_stop=True, coasts=True),
     "sends twice": Ways(tpdo_again_s=0.002, boots_again_s=0.05),
     "is late": Ways(sdo_delay_s=0.05, mode_delay_s=0.1, status_delay=3),
