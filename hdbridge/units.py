@@ -5,6 +5,7 @@ unit (``motor_deg``, ``offset_arcsec``, ``cycle_s``).
 """
 
 import math
+import re
 from typing import Final
 
 ARCSEC_PER_DEG: Final = 3600.0
@@ -34,6 +35,9 @@ _UNITS: Final = {
     "s": "s",
     "k": "K",
 }
+
+FIGURE: Final = re.compile(r"\(?[-+~<]?\d[\d,.]*(e[-+]?\d+)?\)?( ?(s|%))?")
+"""Pattern of a table's cell that contains a number."""
 
 
 def unit_of(name: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -13,7 +13,7 @@ from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
-from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
+from hdbridge.cli.printing import note, print_blocks, progress_bar, say, write_json, write_page, write_result
 from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError, command
 from hdbridge.files.atomic import make_folder, new_folder
@@ -22,15 +22,14 @@ from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.cli.session import Session
-    from hdbridge.commissioning.calibration import Calibration, Callbacks, Journal, Validation
+    from hdbridge.commissioning.calibration import Calibration, Callbacks, Journal
     from hdbridge.commissioning.calibration.pipeline import Offer
-    from hdbridge.commissioning.evaluation.stepping import Stepped
     from hdbridge.drive.drive import Drive
     from hdbridge.motion.procedures.plan import Plan
 
 
 @dataclass(frozen=True)
-class Measured:
+class PlanOptions:
     """Options of a command that measures by a plan."""
 
     plan: Annotated[
@@ -153,9 +152,9 @@ def phases() -> Iterator[Callable[[str, float, float], None]]:
         yield show
 
 
-@taking(Session, Measured)
+@taking(Session, PlanOptions)
 def calibrate(
-    session: Session, measured: Measured, json_file: opt.Json = None, html_file: opt.Html = None
+    session: Session, measured: PlanOptions, json_file: opt.Json = None, html_file: opt.Html = None
 ) -> None:
     """Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.
 
@@ -198,8 +197,8 @@ def _conclude(
         print_next(result.offer, session)
 
 
-@taking(Session, Measured)
-def measure(session: Session, measured: Measured) -> None:
+@taking(Session, PlanOptions)
+def measure(session: Session, measured: PlanOptions) -> None:
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
     The axis moves as in a calibration, without compensation. No model is fitted or changed.
@@ -291,53 +290,20 @@ def report(
     _conclude(concluded(recording), recording, json_file, html_file)
 
 
-TAKEN_OFF = 0.95
-"""Maximum ratio of the residual with the additional terms to that without, for these terms to be reported."""
-
-
 def print_calibration(result: Calibration) -> None:
-    """Prints parameters with intervals, held-out figures, undetermined parameters and the stepping test."""
-    from hdbridge.axis.model.difference import diff
-    from hdbridge.units import figure, unit_of, with_interval
+    """Prints parameters with intervals, the quality of the fit, the tests on the axis, and the decision."""
+    from hdbridge.report.calibration import fit_facts, parameters
+    from hdbridge.report.motion import motion_sections
+    from hdbridge.report.stepping import stepping_sections
 
-    fit = result.fit
-    before = (
-        {(each.effect, each.parameter): each.before for each in diff(result.active, result.model)}
-        if result.active
-        else {}
-    )
-    rows = []
-    for each in fit.intervals:
-        was = before.get((each.effect, each.parameter))
-        value, half_width = with_interval(each.value, each.half_width)
-        known = (value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")
-        # With a previous model there is no room for the unit column; the names contain the units.
-        last = "-" if was is None else with_interval(was, each.half_width)[0]
-        rows.append((each.effect, each.parameter, *known, last if before else unit_of(each.parameter)))
     axis = f"axis '{result.axis}'" if result.axis else ", ".join(result.recordings)
-    columns = ("effect", "parameter", "value", "± 95 %", "was" if before else "unit")
-    print_table(columns, rows, f"Model of {axis}, ratio {result.model.ratio:g}")
-    noise = fit.noise
-    standing = "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f}"
-    apart = ""
-    if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
-        apart = f"; {noise.fitted_arcsec:.2f} without the terms fitted in addition to the model"
-    say(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}")
-    say(f"held out: {fit.held_out.text}")
-    if len(result.drift) > 1:
-        errors = [error for _, error in result.drift]
-        say(f"reference pose: {max(errors) - min(errors):.2f} arcsec of drift over {len(errors)} visits")
-    for test in fit.residual_tests:
-        if not test.passed:
-            say(f"residual: {test.text}")
-    for warning in fit.warnings:
-        say(f"note: {warning}")
-    if result.validation:
-        print_stepping(result.validation)
-    if result.motion:
-        from hdbridge.cli.positioning import print_motion
-
-        print_motion(result.motion)
+    print_blocks(parameters(result), f"Model of {axis}, ratio {result.model.ratio:g}")
+    print_blocks([fit_facts(result)])
+    for section in (
+        *(stepping_sections(result.validation) if result.validation else ()),
+        *(motion_sections(result.motion) if result.motion else ()),
+    ):
+        print_blocks(section.blocks, section.title)
     if result.offer:
         say(result.offer.reason, style=None if result.offer.made else "bold")
 
@@ -345,9 +311,8 @@ def print_calibration(result: Calibration) -> None:
 def write_calibration_page(path: Path, result: Calibration) -> None:
     """Writes the result as a self-contained page."""
     from hdbridge.report.calibration import calibration_page
-    from hdbridge.report.page import render
 
-    write_result(path, render(calibration_page(result)))
+    write_page(path, calibration_page(result))
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
@@ -357,53 +322,6 @@ def print_next(offer: Offer | None, session: Session) -> None:
         daemon = command("ctl", "model", session.axis.name, "pending")
         use = daemon if session.borrow else command("model", "commit", folder)
         say(f"pending: {offer.pending}\nreview it: {command('model', 'diff', folder)}\nuse it: {use}")
-
-
-def print_stepping(checked: Validation) -> None:
-    """Prints the stepping test with the previous and the new model, and the best possible on this axis."""
-    print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
-    print_worse("stepping", checked.worse)
-    _print_accuracy(checked)
-    for line in checked.fault_notes:
-        say(f"note: {line}")
-    floor = checked.floor
-    say(
-        f"best possible on this axis: {floor.three_sigma_arcsec:.2f} arcsec; new model: "
-        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} times that"
-    )
-
-
-def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> None:
-    """Prints scatter and mean of each stepping test; ``first`` is the heading of the column of test names."""
-    columns = (first, "CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean")
-    rows = []
-    for test in tests:
-        parts = (test.cw, test.ccw, test.pooled)
-        figures = (value for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec))
-        rows.append((test.model, *(f"{value:z.2f}" for value in figures)))
-    print_table(columns, rows, title)
-
-
-def print_worse(test: str, ways: Iterable[str]) -> None:
-    """Prints each direction of a test in which the axis became worse."""
-    for each in ways:
-        say(f"{test}: {each}", style="bold")
-
-
-def _print_accuracy(checked: Validation) -> None:
-    from hdbridge.report.stepping import ISO_FIGURES
-
-    found = ((checked.before.model, checked.accuracy_before), (checked.after.model, checked.accuracy_after))
-    rows = [(model, each) for model, each in found if each is not None]
-    if not rows:
-        return
-    figures = [(model, *(f"{getattr(each, name):z.2f}" for name, _ in ISO_FIGURES)) for model, each in rows]
-    print_table(
-        ("with", *(words.replace(" ", "\n") for _, words in ISO_FIGURES)),
-        figures,
-        f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
-        "approaches from each side",
-    )
 
 
 COMMANDS: Final = {"calibrate": calibrate, "measure": measure, "fit": fit, "report": report}

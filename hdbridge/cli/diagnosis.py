@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from typer import Argument, Option
 
 from hdbridge.cli import options as opt
-from hdbridge.cli.calibration import Measured, print_next, print_stepping, print_steps, print_worse
+from hdbridge.cli.calibration import PlanOptions, print_next
 from hdbridge.cli.options import need_extra, taking
-from hdbridge.cli.printing import note, print_table, say, write_json, write_result
+from hdbridge.cli.printing import note, print_blocks, print_table, say, write_json, write_page, write_result
 from hdbridge.cli.recordings import Part, is_flight, remarks
 from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError, command
 from hdbridge.files.outputs import Kind
-from hdbridge.units import figure
 
 if TYPE_CHECKING:
-    from hdbridge.analysis.findings import Diagnosis, Finding
+    from hdbridge.analysis.findings import Diagnosis
     from hdbridge.analysis.probability import Prior
     from hdbridge.commissioning.improvement import Improvement
     from hdbridge.records.recording import Recording
-
-
-WORTH_PRINTING = 0.01
-"""Minimum fraction of the difference that a coordinate must explain to be printed."""
 
 
 @taking(Part, opt.CsvFormat)
@@ -88,8 +83,7 @@ def diagnose(
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.motion.procedures.plan import Plan
     from hdbridge.records.recording import Recording
-    from hdbridge.report.diagnosis import diagnosis_page
-    from hdbridge.report.page import render
+    from hdbridge.report.diagnosis import diagnosis_page, figures, shares_table
 
     flights = [each for each in records or () if is_flight(each)]
     chosen = {"--axis": part.axis, "--from": part.begin, "--to": part.end}
@@ -144,12 +138,13 @@ def diagnose(
             provenance=_provenance(recording, records, path),
             command=command("diagnose", *records, *said),
         )
-        write_result(html_file, render(page))
+        write_page(html_file, page)
     if extend is not None:
         write_result(extend, result.model.dump())
     print_diagnosis(result)
-    _print_figures(result)
-    _print_shares(document["seen_over"])
+    print_blocks(figures(result).blocks, "Model and measurement")
+    shares = {name: tuple(each.values()) for name, each in document["seen_over"].items()}
+    print_blocks([shares_table(shares)], "Fraction of the difference explained by means over a coordinate")
 
 
 def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
@@ -174,64 +169,16 @@ def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
 
 def print_diagnosis(result: Diagnosis) -> None:
     """Prints verdict, findings, next experiments, and causes that were not reported."""
+    from hdbridge.report.diagnosis import finding_blocks, found
+
     say(result.verdict())
     if result.findings:
-        rows = [
-            (
-                each.cause,
-                f"{each.probability:.2f}",
-                figure(each.peak_arcsec, 3),
-                f"{figure(each.gain.before_arcsec, 3)} -> {figure(each.gain.after_arcsec, 3)}"
-                if each.gain
-                else "not made",
-            )
-            for each in result.findings
-        ]
-        print_table(("cause", "probability", "size, arcsec", "held out, arcsec rms"), rows)
-    for each in result.findings:
-        for line in _details(each):
-            say(line)
+        print_blocks(found(result).blocks)
+    for number, each in enumerate(result.findings, 1):
+        say(f"{number}. {each.cause.replace('_', ' ')}", style="bold")
+        print_blocks(finding_blocks(each))
     for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):
         note(remark)
-
-
-def _details(finding: Finding) -> Iterator[str]:
-    """Yields the details of a finding that its table row does not show."""
-    said = []
-    for name, each in finding.parameters.items():
-        value, low, high = map(figure, (each.value, each.low, each.high))
-        said.append(f"{name} {value} ({low} to {high}) {each.unit}".rstrip())
-    if finding.aliases:
-        said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
-    if finding.lives_in:
-        said.insert(0, f"depends on the {finding.lives_in}")
-    if refused := finding.refusal():
-        said.append(f"not offered: {refused}")
-    if finding.experiment:
-        said.append(f"measure next: {finding.experiment}")
-    if finding.prior:
-        said.append(f"prior: {finding.prior}")
-    if said:
-        yield f"{finding.cause}:"
-        yield from (f"  {each}" for each in said)
-
-
-def _print_figures(result: Diagnosis) -> None:
-    rows = [
-        (name, *(f"{value:.2f}" for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)))
-        for name, pair in {"overall": (result.baseline, result.extended), **result.by_kind}.items()
-    ]
-    columns = ("", "as given, rms", "3σ", "extended, rms", "3σ")
-    print_table(columns, rows, "model and measurement, arcsec")
-
-
-def _print_shares(shares: dict[str, dict[str, float]]) -> None:
-    rows = [
-        (name, *(f"{100.0 * value:.1f} %" for value in each.values()))
-        for name, each in sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
-        if max(each.values()) >= WORTH_PRINTING
-    ]
-    print_table(("", "as given", "extended"), rows, "fraction of the difference explained by")
 
 
 def _title(recording: Recording, records: Sequence[Path]) -> str:
@@ -269,10 +216,10 @@ LEFT_OF_FLOOR = 1.5
 """Ratio of the stepping test's three sigma to the best possible, above which a further cause is suspected."""
 
 
-@taking(Session, Measured, opt.CsvFormat)
+@taking(Session, PlanOptions, opt.CsvFormat)
 def improve(
     session: Session,
-    measured: Measured,
+    measured: PlanOptions,
     csv: opt.CsvFormat,
     given: Annotated[
         list[Path] | None,
@@ -325,7 +272,7 @@ def _conclude(
     result: Improvement, folder: Path, session: Session, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Writes and prints the result and the next steps."""
-    from hdbridge.commissioning.calibration.validation import worse_ways
+    from hdbridge.report.stepping import trial_sections
 
     page = html_file or (folder / "report.html" if folder.is_dir() else None)
     write_json(json_file, result.as_dict())
@@ -343,9 +290,8 @@ def _conclude(
             f"{further.duration_s / 60:.0f} min: {further.plan.about}"
         )
     if result.trial is not None:
-        print_stepping(result.trial.stepping)
-        print_steps("Small steps, within the hysteresis: load error at rest, arcsec", result.trial.small)
-        print_worse("small steps", worse_ways(*result.trial.small))
+        for section in trial_sections(result.trial):
+            print_blocks(section.blocks, section.title)
         if result.trial.of_floor > LEFT_OF_FLOOR:
             say(
                 f"stepping is still {result.trial.of_floor:.1f} times the floor: an error remains that "
@@ -361,7 +307,6 @@ def _conclude(
 def _write_improvement_page(path: Path, result: Improvement) -> None:
     """Writes the diagnosis with the stepping test as a self-contained page."""
     from hdbridge.report.diagnosis import diagnosis_page
-    from hdbridge.report.page import render
 
     provenance = {
         "axis": result.axis,
@@ -375,10 +320,10 @@ def _write_improvement_page(path: Path, result: Improvement) -> None:
         result.diagnosis,
         title=f"Improvement of axis '{result.axis}'",
         provenance=provenance,
-        stepping=result.trial.stepping if result.trial else None,
+        trial=result.trial,
         offer=result.offer,
     )
-    write_result(path, render(page))
+    write_page(path, page)
 
 
 COMMANDS: Final = {"diagnose": diagnose, "improve": improve}

@@ -14,7 +14,7 @@ from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import need_extra, taking
-from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_page
 from hdbridge.cli.session import deferred_interrupt
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
@@ -279,7 +279,6 @@ def _summarise(
     from hdbridge.fleet.prior import write_prior
     from hdbridge.fleet.report import ROWS, fleet_page, hours_words, shown
     from hdbridge.fleet.summary import summarise
-    from hdbridge.report.page import render
 
     rows = dataset.recordings()
     latest = shown(rows)
@@ -317,7 +316,7 @@ def _summarise(
     beside = target.resolve().parent == dataset.folder.resolve()
     if not beside:  # pages are in OUT
         found = {joint: (dataset.folder.resolve() / each).as_uri() for joint, each in found.items()}
-    write_result(target, render(fleet_page(summary, dataset.folder, found)))
+    write_page(target, fleet_page(summary, dataset.folder, found))
     return summary
 
 

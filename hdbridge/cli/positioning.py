@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from typer import Option
 
 from hdbridge.cli import options as opt
-from hdbridge.cli.calibration import phases, print_steps
-from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
+from hdbridge.cli.calibration import phases
+from hdbridge.cli.printing import note, print_blocks, print_table, progress_bar, say, write_json, write_page
 from hdbridge.cli.session import Session, note_clamped, on_axis
 from hdbridge.enums import Scheme
 from hdbridge.errors import HdbridgeError, InputError, command
@@ -22,9 +22,7 @@ from hdbridge.files.outputs import Kind, writing
 from hdbridge.files.profile import Profile, no_model
 
 if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
     from hdbridge.axis.model import TransmissionModel
-    from hdbridge.commissioning.calibration.motion import MotionTest
     from hdbridge.commissioning.evaluation.comparison import Comparison
     from hdbridge.control.bench import Run
     from hdbridge.drive.drive import Drive
@@ -221,6 +219,7 @@ def run_comparison(
     from hdbridge.commissioning.evaluation.comparison import Comparison, compare_schemes
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
+    from hdbridge.report.stepping import scheme_blocks
 
     axis = session.axis
     model = TransmissionModel.load(model_path) if model_path else TransmissionModel(axis.gear.ratio)
@@ -273,27 +272,17 @@ def run_comparison(
             write_json(json_file, comparison.as_dict())
             if html_file is not None:
                 _write_stepping_page(html_file, session, model_path, comparison, stepping)
-            _print_stepping(axis, comparison)
-
-
-def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
-    title = f"Load error at rest, arcsec: axis '{axis.name}'"
-    print_steps(title, comparison.results.values(), "compensation")
-    for line in comparison.fault_notes:
-        say(f"note: {line}")
-    best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
-    floor = comparison.quantisation_floor_arcsec
-    say(
-        f"quantisation floor (3 sigma of one motor count): {floor:.2f}; "
-        f"'{best.value}' is at {result.pooled.three_sigma_arcsec / floor:.2f} times that"
-    )
+            floor = comparison.quantisation_floor_arcsec
+            print_blocks(
+                scheme_blocks(comparison.results, floor, comparison.fault_notes),
+                f"Load error at rest: axis '{axis.name}'",
+            )
 
 
 def _write_stepping_page(
     path: Path, session: Session, model: Path | None, comparison: Comparison, stepping: Stepping
 ) -> None:
     """Writes the result as a self-contained page with axis, date and model of the test."""
-    from hdbridge.report.page import render
     from hdbridge.report.stepping import stepping_page
 
     axis, seed = session.axis, session.simulated_seed
@@ -322,7 +311,7 @@ def _write_stepping_page(
         facts,
         with_article=axis.name == "article",
     )
-    write_result(path, render(page))
+    write_page(path, page)
 
 
 @on_axis
@@ -350,6 +339,7 @@ def motion(
     from hdbridge.axis.model.store import propose as keep
     from hdbridge.commissioning.calibration import Callbacks
     from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
+    from hdbridge.report.motion import motion_page, motion_sections
 
     files, axis = session.files, session.axis
     chosen = model or files.model
@@ -363,11 +353,9 @@ def motion(
         identity = drive.identity
     write_json(json_file, result.as_dict())
     if html_file is not None:
-        from hdbridge.report.motion import motion_page
-        from hdbridge.report.page import render
-
-        write_result(html_file, render(motion_page(axis.name, result)))
-    print_motion(result)
+        write_page(html_file, motion_page(axis.name, result))
+    for section in motion_sections(result):
+        print_blocks(section.blocks, section.title)
     if propose and result.response is not None:
         pending = keep(
             files.axis.parent,
@@ -379,37 +367,6 @@ def motion(
         say(f"pending: {pending}; commit it with: {command('model', 'commit', session.profile)}")
         if result.wind_up is not None:
             say("calibrate again after that: with the wind-up compensated, the hysteresis at rest differs")
-
-
-def print_motion(result: MotionTest) -> None:
-    """Prints the result."""
-    from hdbridge.report.motion import PATH_COLUMNS, RIPPLE_COLUMNS, figure, path_rows, ripple_rows
-
-    print_table(RIPPLE_COLUMNS, ripple_rows(result), "Ripple of the load at constant speed, rms arcsec")
-    fastest = result.ripples[-1]
-    orders = [
-        (
-            str(each.order),
-            f"{each.frequency_hz:.0f}",
-            *map(figure, (each.none_arcsec, each.static_arcsec, each.filtered_arcsec)),
-        )
-        for each in fastest.orders
-    ]
-    columns = ("order", "Hz", "none", "static", "filtered")
-    print_table(columns, orders, f"Motor orders at {fastest.speed_deg_s:g} deg/s, arcsec")
-    if result.paths:
-        print_table(PATH_COLUMNS, path_rows(result), "Errors on a path, rms arcsec")
-    if result.response is not None:
-        say(
-            f"response known up to {result.response.known_to_hz:.0f} Hz, "
-            f"following lag {result.response.following_lag_ms:.2f} ms"
-        )
-    if result.wind_up is not None:
-        say(f"wind-up J / K {result.wind_up.inertia_over_stiffness_s2:.3g} s2: compensated in acceleration")
-    if (reached := result.helps_to_deg_s) is not None:
-        say(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
-    for line in result.remarks:
-        say(f"note: {line}")
 
 
 def demo(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -17,10 +16,14 @@ from rich.text import Text
 
 from hdbridge.files.atomic import is_stream, write_atomically
 from hdbridge.files.outputs import writing
+from hdbridge.units import FIGURE
+
+if TYPE_CHECKING:
+    from hdbridge.report.page import Block, Page
 
 Cell = str | Text
-_FIGURE: Final = re.compile(r"\(?[-+~<]?\d[\d,.]*(e[-+]?\d+)?\)?( (s|%))?|not known|-|")
-"""Pattern of a cell with a figure; a column that has only such cells is right-aligned."""
+NO_FIGURE = ("", "-", "not known")
+"""Cells in a column of figures that are not figures."""
 
 
 class _Console(Console):
@@ -62,6 +65,23 @@ def progress_bar() -> Progress:
     )
 
 
+def print_blocks(blocks: Iterable[Block], title: str = "") -> None:
+    """Prints the tables and facts of a report page, the first table with a title, and no charts."""
+    from hdbridge.report import page
+
+    for block in blocks:
+        if isinstance(block, page.Table):
+            columns = [
+                f"{each.name}\n{each.unit}".rstrip() if isinstance(each, page.Heading) else each
+                for each in block.header
+            ]
+            print_table(columns, [[*map(page.text_of, row)] for row in block.rows], title)
+            title = ""
+        elif isinstance(block, page.Facts):
+            for name, value in block.rows:
+                say(f"{name}: {value}")
+
+
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str = "") -> None:
     """Prints a table uncropped, split only on a narrow terminal. An empty row ends a section."""
     for each in tables(columns, rows, title):
@@ -95,7 +115,9 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], title: str, s
     table = Table(title=title or None, title_justify="left")
     for place in shown:
         cells = [str(row[place]) for row in rows if place < len(row)]
-        right = place > 0 and any(cells) and all(map(_FIGURE.fullmatch, cells))
+        right = (
+            place > 0 and any(cells) and all(each in NO_FIGURE or FIGURE.fullmatch(each) for each in cells)
+        )
         table.add_column(columns[place], justify="right" if right else "left", overflow="fold")
     for row in rows:
         if row:
@@ -117,6 +139,13 @@ def write_json(path: Path | None, result: dict[str, Any]) -> None:
     """Writes the result as JSON, unless ``path`` is None."""
     if path is not None:
         write_result(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+def write_page(path: Path, page: Page) -> None:
+    """Writes a report page as one HTML file."""
+    from hdbridge.report.page import render
+
+    write_result(path, render(page))
 
 
 def write_result(path: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from hdbridge.cli import options as opt
 from hdbridge.cli.options import taking
-from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_page
 from hdbridge.errors import InputError, command
 from hdbridge.files.profile import Profile
 
@@ -46,7 +46,6 @@ def twin(
     commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
-    from hdbridge.report.page import render
     from hdbridge.report.twin import twin_page
     from hdbridge.twin.replay import doubts
 
@@ -71,7 +70,7 @@ def twin(
     # Files are written first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, as_dict(report))
     if html_file is not None:
-        write_result(html_file, render(twin_page(report)))
+        write_page(html_file, twin_page(report))
     print_report(report)
 
 

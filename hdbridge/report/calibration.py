@@ -28,14 +28,12 @@ from hdbridge.report.page import (
     Series,
     Status,
     Table,
-    figure,
     histogram,
     parted,
     sentence,
-    with_interval,
 )
 from hdbridge.report.stepping import of_offer, stepping_sections
-from hdbridge.units import DEG_PER_TURN, unit_of, without_unit
+from hdbridge.units import DEG_PER_TURN, figure, unit_of, with_interval, without_unit
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
@@ -62,7 +60,7 @@ def calibration_page(result: Calibration) -> Page:
             ""
             if all(each.identifiable for each in result.fit.intervals)
             else "In brackets: not determined by these data.",
-            [*_parameters(result)],
+            [*parameters(result)],
         ),
         Section(
             "Transmission error",
@@ -87,7 +85,7 @@ def calibration_page(result: Calibration) -> Page:
             "each order fitted alone, which also shows the side lobes of its neighbours.",
             [_spectrum(result)],
         ),
-        Section("Residual of the model", sentence(result.fit.held_out.text), [*_residual(result)]),
+        Section("Residual of the model", "", [*_residual(result)]),
     ]
     if len(result.drift) > 1:
         sections.append(_drift(result))
@@ -235,33 +233,40 @@ def _residual(result: Calibration) -> Iterator[Block]:
         ]
     )
     yield histogram("Residual histogram", R_LABEL, {"residual": left}, height_px=200)
-    noise = fit.noise
-    yield Facts(
-        [
-            ("residual of the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
-            ("... with the terms fitted in addition", f"{noise.fitted_arcsec:.2f} arcsec"),
-            (
-                "noise at rest",
-                "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f} arcsec",
-            ),
-            (
-                "lap to lap",
-                f"{noise.laps_arcsec:.2f} arcsec" if noise.laps_arcsec is not None else "not measured",
-            ),
-            ("samples", f"{noise.samples:,}, worth {noise.effective_samples:,.0f} independent ones"),
-            ("outliers", f"{fit.outliers.samples} samples, given no weight"),
-        ]
-    )
+    yield fit_facts(result)
     rows = [
         [each.name.replace("_", " "), "passed" if each.passed else "look", each.text]
         for each in fit.residual_tests
     ]
     yield Table(["test of the residual", "", "result"], rows)
-    if fit.warnings:
-        yield Facts([("note", each) for each in fit.warnings])
 
 
-def _parameters(result: Calibration) -> Iterator[Block]:
+def fit_facts(result: Calibration) -> Facts:
+    """Returns the figures of the fit, its test on held-out data, failed tests of the residual, and notes."""
+    fit, noise = result.fit, result.fit.noise
+
+    def arcsec(value: float | None) -> str:
+        return "not measured" if value is None else f"{value:.2f} arcsec"
+
+    rows = [
+        ("held out", fit.held_out.text),
+        ("residual of the model, rms of a sample", arcsec(noise.residual_arcsec)),
+        ("... with the terms fitted in addition", arcsec(noise.fitted_arcsec)),
+        ("noise at rest", arcsec(noise.standing_arcsec)),
+        ("lap to lap", arcsec(noise.laps_arcsec)),
+        ("samples", f"{noise.samples:,}, worth {noise.effective_samples:,.0f} independent ones"),
+        ("outliers", f"{fit.outliers.samples} samples, given no weight"),
+    ]
+    if len(result.drift) > 1:
+        errors = [error for _, error in result.drift]
+        moved = f"{max(errors) - min(errors):.2f} arcsec"
+        rows.append(("reference pose", f"zero position moved by {moved} over {len(errors)} visits"))
+    rows += [("residual", each.text) for each in fit.residual_tests if not each.passed]
+    return Facts([*rows, *(("note", each) for each in fit.warnings)])
+
+
+def parameters(result: Calibration) -> Iterator[Block]:
+    """Yields a table of the model's parameters, and one of the quantities fitted in addition."""
     changes = diff(result.active, result.model) if result.active is not None else []
     before = {(each.effect, each.parameter): each.before for each in changes}
     header = ["parameter", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit"]
@@ -302,15 +307,12 @@ def _parameter_words(effect: str, parameter: str) -> str:
 def _change(change: float, parameter: str) -> str:
     if parameter.endswith("phase_deg"):
         change = math.remainder(change, DEG_PER_TURN)
-    return f"{change:+.3g}".replace("-", "\N{MINUS SIGN}")
+    return f"{change:+.3g}"
 
 
 def _drift(result: Calibration) -> Section:
     times, errors = zip(*result.drift, strict=True)
-    text = (
-        f"The axis returned to one pose {len(errors)} times, always from the same side: its zero position "
-        f"moved by {max(errors) - min(errors):.2f} arcsec."
-    )
+    text = "The axis returned to one pose several times, always from the same side."
     series = [Series("error at the pose", times, errors), Series("visits", times, errors, Mark.POINTS)]
     chart = Chart("Error at the reference pose", "time, s", Y_LABEL, series, height_px=200)
     return Section("Reference pose", text, [chart])

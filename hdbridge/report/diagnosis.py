@@ -1,15 +1,13 @@
 """Report page of a diagnosis: verdict, advice, each finding with its chart, and all observations."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
 
 from hdbridge import __version__
-from hdbridge.analysis.capability import certainty
 from hdbridge.analysis.findings import UNEXPLAINED, Diagnosis, Finding
 from hdbridge.analysis.views import ResidualViews
 from hdbridge.axis.effects import CATALOGUE
 from hdbridge.commissioning.calibration.pipeline import Offer
-from hdbridge.commissioning.calibration.validation import Validation
+from hdbridge.commissioning.improvement.trial import Trial
 from hdbridge.report.page import (
     SIGMA,
     Block,
@@ -22,15 +20,10 @@ from hdbridge.report.page import (
     Status,
     Table,
     sentence,
-    with_interval,
 )
 from hdbridge.report.residuals import beside_charts, partial_residual, partial_residual_chart, residual_charts
-from hdbridge.report.stepping import of_offer, stepping_sections
-from hdbridge.units import without_unit
-
-MAX_CLAIMS: Final = 3
-"""Maximum number of findings in the verdict."""
-PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
+from hdbridge.report.stepping import of_offer, trial_sections
+from hdbridge.units import with_interval, without_unit
 
 
 def diagnosis_page(
@@ -38,28 +31,28 @@ def diagnosis_page(
     *,
     title: str,
     provenance: Mapping[str, str] | Sequence[tuple[str, str]] = (),
-    stepping: Validation | None = None,
+    trial: Trial | None = None,
     offer: Offer | None = None,
     command: str = "hdbridge diagnose RECORD... --model MODEL.yaml",
 ) -> Page:
     """Returns the page of a diagnosis.
 
-    ``provenance`` contains names and values that describe the origin of records and model. ``stepping`` is
-    the stepping test with the old and the extended model, if there was one; it precedes the findings.
+    ``provenance`` contains names and values that describe the origin of records and model. ``trial`` has
+    the tests with the old and the extended model, if there were any; they precede the findings.
     ``offer`` is the outcome for the extended model, if it was tested for commit. ``command`` is the command
     line of the diagnosis.
     """
     seen = diagnosis.views()
-    verdict = _verdict(diagnosis, stepping)
+    verdict = diagnosis.verdict()
     given = provenance.items() if isinstance(provenance, Mapping) else provenance
     sections = [_to_do(diagnosis)]
-    if stepping is not None:
-        sections += stepping_sections(stepping)
+    if trial is not None:
+        sections += trial_sections(trial)
     if diagnosis.findings:
-        sections.append(_found(diagnosis))
+        sections.append(found(diagnosis))
     sections += [_finding(number, each, diagnosis) for number, each in enumerate(diagnosis.findings, 1)]
     sections += [
-        _figures(diagnosis),
+        figures(diagnosis),
         Section(
             "Model and measurement",
             "The transmission error on the same trajectory: load encoder minus motor angle divided by the "
@@ -96,45 +89,6 @@ def _commands(diagnosis: Diagnosis, command: str) -> tuple[Command, ...]:
     )
 
 
-def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
-    given, own, after = (
-        _two(each.rms_arcsec) for each in (diagnosis.baseline, diagnosis.refitted, diagnosis.extended)
-    )
-    noise = f"the noise of a reading is {_two(diagnosis.noise_floor_arcsec)}"
-    if not diagnosis.findings:
-        text = (
-            f"Model and measurement are {given} arcsec (rms) apart, which noise and an "
-            f"everyday calibration account for; {noise}."
-        )
-    else:
-        causes = _listed([_claim(each) for each in diagnosis.findings[:MAX_CLAIMS]])
-        if more := len(diagnosis.findings[MAX_CLAIMS:]):
-            causes += f"; and {more} more"
-        text = f"The model is off by {given} arcsec (rms): {causes}."
-        if all(each.cause == UNEXPLAINED for each in diagnosis.findings):
-            text += f" No cause of the catalogue fits it; {noise}."
-        else:
-            same = "a refit of its own parameters does the same"
-            alone = same if own == after else f"with only its own parameters refitted {own}"
-            text += f" With that in the model {after} remain; {alone}; {noise}."
-    text = f"{diagnosis.capability.sentence()} {text}"
-    if stepping is not None:
-        before, now = stepping.before.pooled.three_sigma_arcsec, stepping.after.pooled.three_sigma_arcsec
-        text += f" On the axis, stepping went from {SIGMA} = {before:.2f} to {now:.2f} arcsec."
-    return text
-
-
-def _claim(finding: Finding) -> str:
-    """Describes a finding with its certainty: "backlash behind the gear, up to 3.1 arcsec"."""
-    if finding.cause == UNEXPLAINED:
-        size = f"up to {_two(finding.peak_arcsec)} arcsec"
-        return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
-    name = _title(finding.cause)
-    if finding.aliases:
-        name = _listed([name, *map(_title, finding.aliases)], "or")
-    return f"{certainty(finding.probability)}{name}, up to {_two(finding.peak_arcsec)} arcsec"
-
-
 def _to_do(diagnosis: Diagnosis) -> Section:
     if not diagnosis.findings:
         return Section(
@@ -148,12 +102,11 @@ def _to_do(diagnosis: Diagnosis) -> Section:
         if each.cause in CATALOGUE:
             remedy = CATALOGUE[each.cause].about.remedy
         rows.append((f"{number}. {_name(each.cause)}", sentence(remedy)))
-        if each.experiment:
-            rows.append(("measure next", sentence(each.experiment)))
     return Section("What to do", "", [Facts(rows)])
 
 
-def _found(diagnosis: Diagnosis) -> Section:
+def found(diagnosis: Diagnosis) -> Section:
+    """Returns the table of findings with their probability, size and gain."""
     rows: list[list[str | float]] = []
     for number, each in enumerate(diagnosis.findings, 1):
         rows.append(
@@ -164,24 +117,21 @@ def _found(diagnosis: Diagnosis) -> Section:
                 each.gain.before_arcsec if each.gain else "not made",
                 each.gain.after_arcsec if each.gain else "",
                 f"{100.0 * each.gain.recovered:.0f} %" if each.gain else "",
-                each.refusal() or "yes",
             ]
         )
     header: list[str | Heading] = [
         "cause",
         Heading("probability", ""),
         Heading("size"),
-        Heading("held out, without"),
-        Heading("with"),
-        Heading("gain", "of the squares"),
-        "offered",
+        Heading("held out"),
+        Heading("with it"),
+        Heading("gain", ""),
     ]
     return Section(
         "What was found",
         "Size: half the span of its contribution to this record. Held out: residual (rms) of the given model "
         "with the other findings, and of the written model, on stretches of time left out of the fit. "
-        "Gain: the fraction of the mean square removed. "
-        "Offered: an improvement of the model may contain it; if not, the reason.",
+        "Gain: the fraction of the mean square removed.",
         [Table(header, rows)],
     )
 
@@ -189,10 +139,7 @@ def _found(diagnosis: Diagnosis) -> Section:
 def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     title = _title(finding.cause)
     drawn = partial_residual(finding, diagnosis)
-    blocks: list[Block] = [partial_residual_chart(drawn)]
-    if finding.parameters:
-        blocks.append(_parameters(finding))
-    blocks.append(Facts([*_about(finding)]))
+    blocks = [partial_residual_chart(drawn), *finding_blocks(finding), Facts([*_about(finding)])]
     if drawn.strength is not None:
         text = (
             f"Growth of the {drawn.strength.of} of the model, by least squares in each bin; "
@@ -208,33 +155,40 @@ def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     return Section(f"{number}. {sentence(title).rstrip('.')}", text, blocks)
 
 
+def finding_blocks(finding: Finding) -> Iterator[Block]:
+    """Yields the parameters of a finding, its alternatives and coordinate, and what is left to do."""
+    if finding.parameters:
+        yield _parameters(finding)
+    facts = (
+        ("depends on", finding.lives_in),
+        ("it may also be", _listed([*map(_title, finding.aliases)], "or")),
+        ("not offered", finding.refusal()),
+        ("measure next", finding.experiment),
+        ("prior", finding.prior),
+    )
+    yield Facts([(name, text) for name, text in facts if text])
+
+
 def _parameters(finding: Finding) -> Table:
     rows: list[list[str | float]] = []
     for name, each in finding.parameters.items():
         words = without_unit(name).replace("_", " ")
         unit = "" if each.unit == "1" else each.unit
         if each.high > each.low:
-            value, half = with_interval(each.value, 0.5 * (each.high - each.low))
-            low, high = (with_interval(one, 0.5 * (each.high - each.low))[0] for one in (each.low, each.high))
-            rows.append([words, value, half, low, high, unit])
+            half_width = 0.5 * (each.high - each.low)
+            values = (with_interval(one, half_width)[0] for one in (each.value, each.low, each.high))
+            rows.append([words, *values, unit])
         else:
-            rows.append([words, f"{each.value:.7g}", "by search", "", "", unit])
-    return Table(["parameter", "value", PLUS_MINUS, "from", "to", "unit"], rows)
+            rows.append([words, f"{each.value:.7g}", "by search", "", unit])
+    return Table(["parameter", "value", "95 % from", "to", "unit"], rows)
 
 
 def _about(finding: Finding) -> Iterator[tuple[str, str]]:
     about = CATALOGUE[finding.cause].about if finding.cause in CATALOGUE else None
     yield "probability", _sure(finding)
-    yield (
-        "aliases",
-        _listed([*map(_title, finding.aliases)], "or")
-        if finding.aliases
-        else "no other cause of the catalogue: all are separable with these data"
-        if about
-        else "no cause of the catalogue fits",
-    )
-    if finding.lives_in:
-        yield "depends on", finding.lives_in
+    if not finding.aliases:
+        other = "no other cause of the catalogue: all are separable with these data"
+        yield "aliases", other if about else "no cause of the catalogue fits"
     if about:
         yield "symptom", sentence(about.signature)
         yield "consequence", sentence(about.consequence)
@@ -244,8 +198,6 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
         yield "name in files", finding.cause
     if finding.note:
         yield "note", sentence(finding.note)
-    if finding.prior:
-        yield "prior", sentence(finding.prior)
 
 
 def _sure(finding: Finding) -> str:
@@ -255,7 +207,8 @@ def _sure(finding: Finding) -> str:
     return f"{finding.probability:.2f} that this cause{others} is there"
 
 
-def _figures(diagnosis: Diagnosis) -> Section:
+def figures(diagnosis: Diagnosis) -> Section:
+    """Returns the differences between model and measurement: overall, and by kind of motion."""
     stages: list[list[str | float]] = [
         [words, each.rms_arcsec, each.three_sigma_arcsec]
         for words, each in (
@@ -270,8 +223,8 @@ def _figures(diagnosis: Diagnosis) -> Section:
         for name, (one, other) in diagnosis.by_kind.items()
     ]
     return Section(
-        "Figures",
-        "Differences between model and measurement: overall, by kind of motion and by direction.",
+        "Differences between model and measurement",
+        "Overall, by kind of motion and by direction.",
         [
             Table(["overall", Heading("rms"), Heading(SIGMA)], stages),
             Table(["motion", *map(Heading, ("as given, rms", SIGMA, "extended, rms", SIGMA))], kinds),
@@ -280,10 +233,6 @@ def _figures(diagnosis: Diagnosis) -> Section:
 
 
 def _over(seen: ResidualViews) -> Section:
-    shares = sorted(seen.shares().items(), key=lambda each: -each[1][0])
-    rows: list[list[str | float]] = [
-        [name, f"{100.0 * before:.1f} %", f"{100.0 * after:.1f} %"] for name, (before, after) in shares
-    ]
     return Section(
         "Residuals over all coordinates",
         "Measurement minus model; lines are means over bins, grey dots readings minus the model as given, "
@@ -291,12 +240,19 @@ def _over(seen: ResidualViews) -> Section:
         "square that such means predict on other stretches of time.",
         [
             Grid([*residual_charts(seen)]),
-            Table(
-                ["over the", Heading("as given", "of the squares"), Heading("extended", "of the squares")],
-                rows,
-            ),
+            shares_table(seen.shares()),
         ],
     )
+
+
+def shares_table(shares: Mapping[str, tuple[float, float]]) -> Table:
+    """Returns the fraction of the mean square that each coordinate explains (`ResidualViews.shares`)."""
+    rows = [
+        [name, f"{100.0 * before:.1f} %", f"{100.0 * after:.1f} %"]
+        for name, (before, after) in sorted(shares.items(), key=lambda each: -each[1][0])
+    ]
+    heads = (Heading(each, "of the squares") for each in ("as given", "extended"))
+    return Table(["over the", *heads], rows)
 
 
 def _could(diagnosis: Diagnosis) -> Section:
@@ -344,8 +300,3 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
     if len(words) < 2 or any("," in each for each in words):
         return "; ".join(words)
     return f"{', '.join(words[:-1])} {last} {words[-1]}"
-
-
-def _two(value: float) -> str:
-    """Formats a value with two decimals, or with one decimal from 10 on."""
-    return f"{value:.1f}" if value >= 9.95 else f"{value:.2f}"

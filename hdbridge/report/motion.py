@@ -1,12 +1,12 @@
 """Report page of the motion test: ripple over speed, and the measured response."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from hdbridge import __version__
 from hdbridge.axis.model.response import Response
 from hdbridge.commissioning.calibration.motion import MotionTest, OrderRipple, Ripple
-from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
+from hdbridge.report.page import Chart, Facts, Grid, Heading, Mark, Page, Section, Series, Table
 
 RIPPLE_COLUMNS = ("deg/s", "none", "static", "removed", "filtered", "removed", "orders faded out")
 PATH_COLUMNS = ("path", "correction", "path error", "with wind-up", "at rest", "settled after, ms")
@@ -33,16 +33,19 @@ def motion_sections(result: MotionTest) -> list[Section]:
     """Returns the sections: ripple over speed, motor orders, path errors and response, if measured."""
     sections = [
         Section(
-            "Ripple over speed", blocks=[Grid([_ripple(result)]), Table(RIPPLE_COLUMNS, ripple_rows(result))]
+            "Ripple over speed, rms arcsec",
+            blocks=[Grid([_ripple(result)]), Table(RIPPLE_COLUMNS, _ripple_rows(result))],
         ),
         Section(
             "Motor orders",
             "Amplitude of each motor order of the load error.",
-            [Grid([_spectrum(each) for each in result.ripples if each.orders])],
+            [_orders(result.ripples[-1]), Grid([_spectrum(each) for each in result.ripples if each.orders])],
         ),
     ]
     if result.paths:
-        sections.append(Section("Path error", PATH_WORDS, [Table(PATH_COLUMNS, path_rows(result))]))
+        sections.append(
+            Section("Errors on a path, rms arcsec", PATH_WORDS, [Table(PATH_COLUMNS, _path_rows(result))])
+        )
     if result.response is not None:
         sections.append(
             Section(
@@ -52,7 +55,33 @@ def motion_sections(result: MotionTest) -> list[Section]:
                 [Grid(_response(result.response))],
             )
         )
+    sections.append(Section("Result", blocks=[Facts([*_facts(result)])]))
     return sections
+
+
+def _facts(result: MotionTest) -> Iterator[tuple[str, str]]:
+    if (response := result.response) is not None:
+        lag = f"following lag {response.following_lag_ms:.2f} ms"
+        yield "response", f"known up to {response.known_to_hz:.0f} Hz, {lag}"
+    if result.wind_up is not None:
+        value = f"{result.wind_up.inertia_over_stiffness_s2:.3g} s2"
+        yield "wind-up J / K", f"{value}, compensated in acceleration"
+    if (reached := result.helps_to_deg_s) is not None:
+        yield "the compensation removes half of the ripple or more", f"up to {reached:g} deg/s"
+    yield from (("note", each) for each in result.remarks)
+
+
+def _orders(ripple: Ripple) -> Table:
+    rows = [
+        [
+            str(each.order),
+            f"{each.frequency_hz:.0f}",
+            *map(_figure, (each.none_arcsec, each.static_arcsec, each.filtered_arcsec)),
+        ]
+        for each in ripple.orders
+    ]
+    columns = [Heading(each) for each in ("none", "static", "filtered")]
+    return Table([f"order, at {ripple.speed_deg_s:g} deg/s", Heading("frequency", "Hz"), *columns], rows)
 
 
 def _verdict(result: MotionTest) -> str:
@@ -87,15 +116,14 @@ def _curves(x: list[float], errors: Sequence[Ripple] | Sequence[OrderRipple], ma
     return series
 
 
-def ripple_rows(result: MotionTest) -> list[list[str]]:
-    """Returns a table row with `RIPPLE_COLUMNS` for each speed."""
+def _ripple_rows(result: MotionTest) -> list[list[str]]:
     return [
         [
             f"{each.speed_deg_s:g}",
-            figure(each.none_arcsec),
-            figure(each.static_arcsec),
+            _figure(each.none_arcsec),
+            _figure(each.static_arcsec),
             _percent(each.removed_static_percent),
-            figure(each.filtered_arcsec),
+            _figure(each.filtered_arcsec),
             _percent(each.removed_percent),
             " ".join(map(str, each.faded_orders)),
         ]
@@ -103,8 +131,7 @@ def ripple_rows(result: MotionTest) -> list[list[str]]:
     ]
 
 
-def figure(value: float | None) -> str:
-    """Formats a value with two decimals; returns an empty text for None."""
+def _figure(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
@@ -112,8 +139,7 @@ def _percent(value: float | None) -> str:
     return "" if value is None else f"{value:.0f} %"
 
 
-def path_rows(result: MotionTest) -> list[list[str]]:
-    """Returns a table row with `PATH_COLUMNS` for each path and correction."""
+def _path_rows(result: MotionTest) -> list[list[str]]:
     return [
         [
             each.name,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -22,8 +21,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from hdbridge import units
 from hdbridge.axis.effects import FloatArray
+from hdbridge.units import FIGURE
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
@@ -35,32 +34,10 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
-def figure(value: float, digits: int = 4) -> str:
-    """Formats a number with ``digits`` significant digits and a typographic minus sign."""
-    return _typeset(units.figure(value, digits))
-
-
-def with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """Formats a half width with two significant digits, and the value with the same number of decimals."""
-    text, half = units.with_interval(value, half_width)
-    return _typeset(text), _typeset(half)
-
-
-def with_decimals(value: float) -> str:
-    """Formats a value with two decimals and a typographic minus sign, which a zero does not have."""
-    text = f"{value:.2f}"
-    return text.lstrip("-") if float(text) == 0.0 else _typeset(text)
-
-
-def _typeset(number: str) -> str:
-    return number.replace("-", "\N{MINUS SIGN}")
-
-
 POINTS_MAXIMUM: Final = 4000
 """Maximum number of points of a series in a page; longer series are thinned to limit a page to a megabyte."""
 PAUSE_STEPS: Final = 20.0
 """Minimum pause between two runs, in median time steps."""
-_FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
 """Number of significant digits relative to a series' span. It resolves a hundredth of a screen pixel; more
 digits would only enlarge the page."""
@@ -218,7 +195,7 @@ def render(page: Page) -> str:
         unit_of=lambda heading: heading.unit if isinstance(heading, Heading) else "",
         name_of=lambda heading: heading.name if isinstance(heading, Heading) else heading,
         is_words=_is_words,
-        text_of=_text_of,
+        text_of=_markup_of,
         charts=Markup(_script_safe([_chart_data(chart) for chart in charts])),
         uplot_script=Markup(_asset("uPlot.iife.min.js")),
         uplot_style=Markup(_asset("uPlot.min.css")),
@@ -356,20 +333,26 @@ def _significant(values: FloatArray) -> list[float | None]:
     return [float(f"{value:.{DIGITS - 1}g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _text_of(cell: Cell) -> str:
-    if isinstance(cell, str):
-        return cell
+def text_of(cell: Cell) -> str:
+    """Returns the text of a cell; numbers have two decimals."""
     if isinstance(cell, Link):
-        return Markup('<a href="{}">{}</a>').format(cell.address, cell.text)
-    return with_decimals(cell)
+        return cell.text
+    return cell if isinstance(cell, str) else f"{cell:z.2f}"
+
+
+def _markup_of(cell: Cell) -> str:
+    """Returns a link, or the text of a cell, with a typographic minus sign in numbers."""
+    text = text_of(cell)
+    if isinstance(cell, Link):
+        return Markup('<a href="{}">{}</a>').format(cell.address, text)
+    return text.replace("-", "\N{MINUS SIGN}") if FIGURE.fullmatch(text) else text
 
 
 def _is_words(table: Table, column: int) -> bool:
     """Returns True for the first column and any column without numbers, which are left-aligned."""
     cells = [row[column] for row in table.rows if column < len(row)]
     return column == 0 or not any(
-        isinstance(cell, int | float) or (isinstance(cell, str) and _FIGURE.match(cell) is not None)
-        for cell in cells
+        not isinstance(cell, Link) and FIGURE.fullmatch(text_of(cell)) is not None for cell in cells
     )
 
 

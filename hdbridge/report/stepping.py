@@ -1,13 +1,15 @@
 """Report of stepping tests: a page that compares schemes, and sections for a test before and after."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Final
 
 from hdbridge import __version__
 from hdbridge.commissioning.calibration.pipeline import Offer
-from hdbridge.commissioning.calibration.validation import Validation
+from hdbridge.commissioning.calibration.validation import Validation, worse_ways
 from hdbridge.commissioning.evaluation.stepping import Stepped
+from hdbridge.commissioning.improvement.trial import Trial
 from hdbridge.enums import Scheme
 from hdbridge.errors import command
 from hdbridge.report.page import (
@@ -27,52 +29,56 @@ from hdbridge.report.page import (
     Status,
     Table,
     histogram,
-    with_decimals,
 )
 
 X_LABEL: Final = "load target, deg"
 Y_LABEL: Final = "load error, arcsec"
 WAYS: Final = ("there (CW)", "back (CCW)")
 ISO_FIGURES: Final = (
-    ("accuracy_arcsec", "accuracy A"),
-    ("repeatability_arcsec", "repeatability R"),
-    ("reversal_arcsec", "reversal B"),
-    ("systematic_arcsec", "systematic E"),
-    ("range_arcsec", "range M"),
+    ("accuracy_arcsec", "accuracy\nA"),
+    ("repeatability_arcsec", "repeatability\nR"),
+    ("reversal_arcsec", "reversal\nB"),
+    ("systematic_arcsec", "systematic\nE"),
+    ("range_arcsec", "range\nM"),
 )
 
 
 def stepping_sections(checked: Validation) -> list[Section]:
     """Returns sections for the stepping test and, if there was one, the positioning test (ISO 230-2)."""
-    return [Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]), *_iso_section(checked)]
-
-
-def _stepping_text(checked: Validation) -> str:
-    share = checked.after.pooled.three_sigma_arcsec / checked.floor.three_sigma_arcsec
-    return (
-        f"The axis stepped both ways, before and after. This axis's counts and noise allow {SIGMA} = "
-        f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is {share:.2f} times "
-        f"that.{''.join(f' It became {each}.' for each in checked.worse)}"
-        f"{''.join(f' Noted: {each}.' for each in checked.fault_notes)}"
-    )
-
-
-def _stepping(checked: Validation) -> Iterator[Block]:
-    tests = {"before": checked.before, "after": checked.after}
-    range_ = _range(tests.values())
-    charts = [
-        Chart(
-            f"{when.capitalize()}: {each.model}", X_LABEL, Y_LABEL, _ways(each), height_px=240, y_range=range_
-        )
-        for when, each in tests.items()
+    best_arcsec = checked.floor.three_sigma_arcsec
+    facts = [
+        (
+            "best possible on this axis",
+            f"{best_arcsec:.2f} arcsec; new model: "
+            f"{checked.after.pooled.three_sigma_arcsec / best_arcsec:.2f} times that",
+        ),
+        *(("stepping", each) for each in checked.worse),
+        *(("note", each) for each in checked.fault_notes),
     ]
+    tests = (checked.before, checked.after)
+    range_ = _range(tests)
     remains = _ways(checked.after)
-    rows: list[list[str | float]] = [
-        [f"{when}: {each.model}", *_scatter(each)] for when, each in tests.items()
+    charts = [
+        *(
+            Chart(f"{when}: {each.model}", X_LABEL, Y_LABEL, _ways(each), height_px=240, y_range=range_)
+            for when, each in zip(("Before", "After"), tests, strict=True)
+        ),
+        Chart("After, enlarged", X_LABEL, Y_LABEL, remains, height_px=240),
+        _histogram("After: error histogram", remains, 240),
     ]
-    yield Table(["with", *(Heading(each) for each in SCATTER)], rows)
-    after = Chart("After, enlarged", X_LABEL, Y_LABEL, remains, height_px=240)
-    yield Grid([*charts, after, _histogram("After: error histogram", remains, 240)])
+    text = "The axis stepped both ways, with the previous and with the new model."
+    blocks: list[Block] = [scatter_table(tests), Facts(facts), Grid(charts)]
+    return [Section("Stepping test: load error at rest", text, blocks), *_iso_section(checked)]
+
+
+def trial_sections(trial: Trial) -> list[Section]:
+    """Returns sections for the stepping test and the small steps of an improvement."""
+    worse = [("small steps", each) for each in worse_ways(*trial.small)]
+    title = "Small steps, within the hysteresis: load error at rest"
+    return [
+        *stepping_sections(trial.stepping),
+        Section(title, "", [scatter_table(trial.small), Facts(worse)]),
+    ]
 
 
 def _range(tests: Iterable[Stepped]) -> tuple[float, float]:
@@ -89,10 +95,24 @@ def _ways(test: Stepped) -> list[Series]:
     ]
 
 
-def _scatter(test: Stepped) -> list[float]:
-    """Returns a test's values for the columns `SCATTER`."""
-    parts = (test.pooled, test.cw, test.ccw)
-    return [value for each in parts for value in (each.three_sigma_arcsec, each.mean_arcsec)]
+def scatter_table(tests: Iterable[Stepped], first: str = "with", *, with_article: bool = False) -> Table:
+    """Returns scatter and mean of each test; ``first`` is the heading of the column of test names."""
+    header: list[str | Heading] = [first, *(Heading(each) for each in SCATTER)]
+    if with_article:
+        header += [Heading(f"article {SIGMA}"), Heading("mean")]
+    rows: list[list[str | float]] = []
+    for test in tests:
+        parts = (test.pooled, test.cw, test.ccw)
+        rows.append([test.model, *(value for each in parts for value in asdict(each).values())])
+        if with_article:
+            rows[-1] += ARTICLE_TABLE_3.get(test.model, ("", ""))
+    caption = ""
+    if with_article:
+        caption = (
+            "On the right the article's Table 3. Its own Tables 1 and 2, which this axis has, cannot give "
+            "it: see docs/method.md"
+        )
+    return Table(header, rows, caption)
 
 
 def _histogram(caption: str, ways: Sequence[Series], height_px: int) -> Chart:
@@ -101,20 +121,20 @@ def _histogram(caption: str, ways: Sequence[Series], height_px: int) -> Chart:
 
 def _iso_section(checked: Validation) -> list[Section]:
     given = [
-        (when, each)
-        for when, each in (("before", checked.accuracy_before), ("after", checked.accuracy_after))
+        (test.model, each)
+        for test, each in (
+            (checked.before, checked.accuracy_before),
+            (checked.after, checked.accuracy_after),
+        )
         if each is not None
     ]
     if not given:
         return []
-    rows = [[when, *(getattr(each, name) for name, _ in ISO_FIGURES)] for when, each in given]
+    rows = [[model, *(getattr(each, name) for name, _ in ISO_FIGURES)] for model, each in given]
     tested = given[-1][1]
-    text = (
-        f"The figures of ISO 230-2 for a rotary axis: {tested.targets} targets, each approached "
-        f"{tested.runs} times from either side."
-    )
+    title = f"Positioning test (ISO 230-2): {tested.targets} targets, {tested.runs} approaches from each side"
     headings = [Heading(words) for _, words in ISO_FIGURES]
-    return [Section("Accuracy and repeatability", text, [Table(["with", *headings], rows)])]
+    return [Section(title, "", [Table(["with", *headings], rows)])]
 
 
 def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
@@ -166,7 +186,7 @@ def stepping_page(
         title=f"Stepping test of axis '{axis_name}'",
         verdict=_verdict(results, floor_arcsec),
         sections=[
-            Section("Figures", blocks=[_table(results, with_article)]),
+            Section("Figures", blocks=scheme_blocks(results, floor_arcsec, with_article=with_article)),
             Section(
                 "Load error at rest",
                 "Each point is one step: the load encoder's reading at rest, minus the target. The two "
@@ -188,6 +208,26 @@ def stepping_page(
     )
 
 
+def scheme_blocks(
+    results: Mapping[Scheme, Stepped],
+    floor_arcsec: float,
+    fault_notes: Iterable[str] = (),
+    *,
+    with_article: bool = False,
+) -> list[Block]:
+    """Returns the figures of all schemes, tolerated faults, and the best scheme relative to the floor."""
+    best = _best(results)
+    times = results[best].pooled.three_sigma_arcsec / floor_arcsec
+    facts = [
+        *(("note", each) for each in fault_notes),
+        (
+            "quantisation floor (3 sigma of one motor count)",
+            f"{floor_arcsec:.2f}; '{best.value}' is at {times:.2f} times that",
+        ),
+    ]
+    return [scatter_table(results.values(), "compensation", with_article=with_article), Facts(facts)]
+
+
 def _best(results: Mapping[Scheme, Stepped]) -> Scheme:
     return min(results, key=lambda scheme: results[scheme].pooled.three_sigma_arcsec)
 
@@ -197,7 +237,7 @@ def _verdict(results: Mapping[Scheme, Stepped], floor_arcsec: float) -> str:
     pooled = results[best].pooled
     text = (
         f"With {NAMES[best]}, the load's error at rest is {pooled.three_sigma_arcsec:.2f} arcsec ({SIGMA}) "
-        f"about a mean of {with_decimals(pooled.mean_arcsec)}: "
+        f"about a mean of {pooled.mean_arcsec:z.2f}: "
         f"{pooled.three_sigma_arcsec / floor_arcsec:.2f} times the {floor_arcsec:.2f} that one motor count "
         "allows"
     )
@@ -211,7 +251,7 @@ def _errors(scheme: Scheme, result: Stepped, range_: tuple[float, float]) -> Cha
     pooled = result.pooled
     caption = (
         f"{NAMES[scheme].capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f} arcsec, "
-        f"mean {with_decimals(pooled.mean_arcsec)} arcsec"
+        f"mean {pooled.mean_arcsec:z.2f} arcsec"
     )
     return Chart(caption, X_LABEL, Y_LABEL, _ways(result), height_px=250, y_range=range_)
 
@@ -224,22 +264,3 @@ def _remaining(result: Stepped, floor_arcsec: float) -> list[Chart]:
         Chart("Error of each step", X_LABEL, Y_LABEL, ways, height_px=280, levels=levels),
         _histogram("Error histogram", ways, 280),
     ]
-
-
-def _table(results: Mapping[Scheme, Stepped], with_article: bool) -> Table:
-    header: list[str | Heading] = ["compensation", *(Heading(each) for each in SCATTER)]
-    if with_article:
-        header += [Heading(f"article {SIGMA}"), Heading("mean")]
-    rows: list[list[str | float]] = []
-    for scheme, result in results.items():
-        row: list[str | float] = [scheme.value, *_scatter(result)]
-        if with_article:
-            row += ARTICLE_TABLE_3.get(scheme.value, ("", ""))
-        rows.append(row)
-    caption = ""
-    if with_article:
-        caption = (
-            "On the right the article's Table 3. Its own Tables 1 and 2, which this axis has, cannot give "
-            "it: see docs/method.md"
-        )
-    return Table(header, rows, caption)

@@ -21,13 +21,13 @@ from hdbridge.report.page import (
     Series,
     Status,
     Table,
-    figure,
     sentence,
 )
 from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.misfit import ChannelResidual, Values
 from hdbridge.twin.naming import Finding, InseparableSet
 from hdbridge.twin.translate import Row as Translated
+from hdbridge.units import figure
 
 WINDOW_S: Final = 1.0
 """Duration shown in a detail chart."""

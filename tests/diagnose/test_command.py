@@ -50,7 +50,7 @@ def test_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_pat
     tables = [line for line in result.output.splitlines() if line[:1] in "│┃┏└┡"]
     assert max(map(len, tables)) <= 80
     assert "…" not in result.output
-    assert "order_5_amplitude_arcsec" in result.output
+    assert "order 5 amplitude" in result.output
 
 
 @pytest.mark.parametrize(

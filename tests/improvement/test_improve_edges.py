@@ -118,5 +118,5 @@ def test_worsening_in_one_direction_is_reported():
     assert trial.worse == checked.worse
     assert checked.as_dict()["worse"] == list(checked.worse)
     (section, *_) = stepping_sections(checked)
-    assert "It became worse CCW" in section.text
+    assert ("stepping", checked.worse[0]) in section.blocks[1].rows
     assert Validation(after, before, Floor(1.0, 0.5)).worse == ()

@@ -219,7 +219,7 @@ def test_missing_hold_out_is_reported():
     fit = dataclasses.replace(fitted(), held_out=HeldOut(None, None, float("nan"), said))
     calibration = dataclasses.replace(result(), fit=fit)
     text, _ = read(calibration)
-    assert "Nothing was held out" in text
+    assert "nothing was held out" in text
     data = json.loads(json.dumps(calibration.as_dict(), allow_nan=False))["held_out"]
     assert (data["before_arcsec"], data["after_arcsec"], data["fitted_arcsec"]) == (None, None, None)
     assert data["improves"] is False

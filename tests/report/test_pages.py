@@ -150,8 +150,8 @@ def outcome(cw, ccw):
 
 def test_the_stepping_page_states_the_result_in_one_sentence():
     results = {
-        Scheme.NONE: Stepped.of("", outcome([40, 44], [-40, -36])),
-        Scheme.BOTH: Stepped.of("", outcome([1, -1], [0.5, -0.5])),
+        Scheme.NONE: Stepped.of("none", outcome([40, 44], [-40, -36])),
+        Scheme.BOTH: Stepped.of("both", outcome([1, -1], [0.5, -0.5])),
     }
     text = render(stepping_page("a<b", results, 2.8, {"gear ratio": "50"}, with_article=True))
     words = " ".join(Reader(text).text)
@@ -168,7 +168,7 @@ def test_the_stepping_page_states_the_result_in_one_sentence():
 
 
 def test_the_pooled_figures_come_first_and_every_column_of_figures_has_its_unit():
-    results = {Scheme.NONE: Stepped.of("", outcome([40, 44], [-40, -36]))}
+    results = {Scheme.NONE: Stepped.of("none", outcome([40, 44], [-40, -36]))}
     text = render(stepping_page("a", results, 2.8, {}))
     header = re.search(r"<thead>(.*?)</thead>", text)[1]
     columns = re.findall(r'<th scope="col">(.*?) <span class="unit">(.*?)</span></th>', header)
