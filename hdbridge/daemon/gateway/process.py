@@ -33,7 +33,7 @@ _LOG: Final = logging.getLogger(__name__)
 ALIVE_S: Final = 0.1
 
 
-class SimulatedClock:
+class ControlLoopClock:
     """Virtual clock of simulated drives: time of the control loop's last cycle, plus the time since then.
 
     It waits for a control loop that lags, but not for one whose process has ended.
@@ -84,7 +84,7 @@ def serve(start: Start) -> None:
                 return None  # parameters stored by 1010h are lost when the process ends
 
         simulation = start.simulation
-        clock: Clock = MonotonicClock() if simulation is None else SimulatedClock(memory, simulation.speed)
+        clock: Clock = MonotonicClock() if simulation is None else ControlLoopClock(memory, simulation.speed)
         gateway = Gateway(
             bus,
             [(axis.config, axis.model()) for axis in machine.axes],
