@@ -11,14 +11,12 @@ steeper. The inverse therefore uses a smaller slope there (`gentle_tracker`).
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Coefficient, Compensable, Part, Shape, Tracker
+from hdbridge.axis.effects.base import Linear
+from hdbridge.axis.effects.described import Compensable, Part, Shape, Tracker
 from hdbridge.axis.effects.motion import FloatArray, Motion, Start
 from hdbridge.axis.effects.path import once
 
@@ -51,7 +49,7 @@ def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
     return xi * (slope if slope < steepest else steepest)
 
 
-class ElasticLoop(Effect):
+class ElasticLoop(Linear):
     """Base class of hysteresis laws: a loop between plus and minus the offset, proportional to the offset."""
 
     compensable = Compensable(True, "the load really has this error, and the command says where it reverses")
@@ -62,6 +60,7 @@ class ElasticLoop(Effect):
     typical = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
     """Loop of a published gear with ratio 50."""
     part = Part.LOOP
+    linear = ("offset_arcsec",)
     drifting = ("offset_arcsec",)
     """Only the offset drifts, because preload settles and friction changes."""
 
@@ -78,16 +77,6 @@ class ElasticLoop(Effect):
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         return self._loop(motion.motor_deg, start)[:, np.newaxis]
-
-    def coefficients(self) -> FloatArray:
-        return np.array([self.offset_arcsec])
-
-    def named_coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
-
-    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the loop with a new offset and, if given, a new width and exponent."""
-        return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:
         return abs(self.offset_arcsec)
