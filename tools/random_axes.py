@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
+from hdbridge.commissioning.calibration import Calibration, Journal, calibrate
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.plan import Plan
@@ -83,5 +83,5 @@ def calibration(drive: Drive, plan: Plan, folder: Path) -> Calibration:
     """Calibrates a booted axis without a model, stepping test included; ``folder`` becomes its profile."""
     content = drive.axis.model_dump(mode="json", by_alias=True, exclude_none=True)
     (folder / "axis.yaml").write_text(yaml.safe_dump(content))
-    journal = start_journal(folder / "recording", drive.axis, plan, DATE, drive.identity)
+    journal = Journal.create(folder / "recording", drive.axis, plan, DATE, drive.identity)
     return calibrate(drive, journal, folder, DATE)

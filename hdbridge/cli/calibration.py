@@ -104,13 +104,13 @@ class Measurement:
 
     def begun(self, drive: Drive) -> Journal:
         """Returns the journal to continue, or starts a new one for this booted drive."""
-        from hdbridge.commissioning.calibration import start_journal
+        from hdbridge.commissioning.calibration import Journal
 
         if self.journal is not None:
             return self.journal
         seed = self.session.simulated_seed
         about = {} if seed is None else {"simulated": True, "seed": seed}
-        return start_journal(self.folder, self.session.axis, self.plan, self.date, drive.identity, about)
+        return Journal.create(self.folder, self.session.axis, self.plan, self.date, drive.identity, about)
 
     @contextmanager
     def booted(self) -> Iterator[tuple[Drive, Callbacks]]:
@@ -186,9 +186,11 @@ def _conclude(
     session: Session | None = None,
 ) -> None:
     """Writes and prints the result; for a measurement in a session, also the next steps."""
+    from hdbridge.report.calibration import calibration_page
+
     page = html_file or folder / "report.html"
     write_json(json_file, result.as_dict())
-    write_calibration_page(page, result)
+    write_page(page, calibration_page(result))
     print_calibration(result)
     if session is not None:
         say(f"\nrecording: {folder}")
@@ -253,6 +255,7 @@ def fit(
     from hdbridge.axis import AxisConfig
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.commissioning.calibration import fit
+    from hdbridge.report.calibration import calibration_page
 
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
     loaded = csv.load(records)
@@ -266,7 +269,7 @@ def fit(
         write_result(out, found.model.dump())
     write_json(json_file, found.as_dict())
     if html_file is not None:
-        write_calibration_page(html_file, found)
+        write_page(html_file, calibration_page(found))
     print_calibration(found)
     if out is not None and not refused:
         say(f"model: {out}")
@@ -306,13 +309,6 @@ def print_calibration(result: Calibration) -> None:
         print_blocks(section.blocks, section.title)
     if result.offer:
         say(result.offer.reason, style=None if result.offer.made else "bold")
-
-
-def write_calibration_page(path: Path, result: Calibration) -> None:
-    """Writes the result as a self-contained page."""
-    from hdbridge.report.calibration import calibration_page
-
-    write_page(path, calibration_page(result))
 
 
 def print_next(offer: Offer | None, session: Session) -> None:

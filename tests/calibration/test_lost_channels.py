@@ -7,7 +7,7 @@ from support.exercised import booted
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.calibration import Callbacks, measure, start_journal
+from hdbridge.commissioning.calibration import Callbacks, Journal, measure
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.truth import Truth
 
@@ -21,7 +21,7 @@ def measured(cell, silent_cycles):
     with booted(axis, truth, 1) as (drive, node):
         date = datetime(2026, 1, 2, tzinfo=UTC)
         plan = Plan.load(str(cell.folder / "short.yaml"))
-        journal = start_journal(cell.folder / "rec", axis, plan, date, drive.identity)
+        journal = Journal.create(cell.folder / "rec", axis, plan, date, drive.identity)
 
         def each_cycle():
             nonlocal cycles

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hdbridge import InputError, TransmissionModel, fit
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
-from hdbridge.commissioning.calibration import start_journal
+from hdbridge.commissioning.calibration import Journal
 from hdbridge.commissioning.calibration.measure import remaining_plan
 from hdbridge.control.bench import Run, axis_view, compensation_for, record_of, run_moves
 from hdbridge.control.compensation import Compensation
@@ -171,7 +171,7 @@ def calibrated(axis: EverydayAxis, folder: Path, seed: int) -> TransmissionModel
     if not kept.exists():
         shutil.rmtree(folder, ignore_errors=True)
         rig = PlantRig(axis, seed)
-        journal = start_journal(folder / "recording", axis.config, Plan.load(axis.plan), DATE, rig.identity)
+        journal = Journal.create(folder / "recording", axis.config, Plan.load(axis.plan), DATE, rig.identity)
         journal.begin_session()
         bench = rig.bench()
         for task in remaining_plan(journal.plan, axis.config).tasks:

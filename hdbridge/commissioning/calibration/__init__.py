@@ -10,7 +10,7 @@
 
 from hdbridge.commissioning.calibration.identification import identify, measured_of
 from hdbridge.commissioning.calibration.journal import Journal
-from hdbridge.commissioning.calibration.measure import Callbacks, measure, start_journal
+from hdbridge.commissioning.calibration.measure import Callbacks, measure
 from hdbridge.commissioning.calibration.pipeline import Calibration, Offer, calibrate, concluded, fit
 from hdbridge.commissioning.calibration.validation import Validation, validate
 
@@ -26,6 +26,5 @@ __all__ = [
     "identify",
     "measure",
     "measured_of",
-    "start_journal",
     "validate",
 ]

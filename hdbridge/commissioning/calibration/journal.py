@@ -5,14 +5,16 @@ measurement ends (Ctrl-C, a fault, a kill, a power cut), the folder contains all
 samples of an interrupted task if there was time to write them. `Journal.open` resumes it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.control.bench import axis_view
 from hdbridge.control.faultcounts import FaultCount, fault_notes
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import read_yaml
@@ -76,20 +78,29 @@ class Journal:
         plan: Plan,
         date: datetime,
         identity: Identity,
-        notes: dict[str, Any],
+        notes: Mapping[str, Any] = MappingProxyType({}),
     ) -> Self:
-        """Creates a journal, written with its first task. InputError if the folder contains a recording."""
+        """Creates a journal, written with its first task; notes the parts of the plan that are shortened.
+
+        InputError if the folder contains a recording, or if the axis has no encoder at its load.
+        """
+        axis.require_load_encoder()
         if (folder / ABOUT_NAME).exists():
             raise InputError(
                 f"{folder}: already contains a recording; expected a new folder, or --resume to continue it"
             )
+        shortened = plan.tasks(axis_view(axis)).notes
         about = RecordingFile.made(
             axis=axis.name,
             ratio=axis.gear.ratio,
             drive=identity,
             date=date.isoformat(timespec="seconds"),
             versions=versions_here(),
-            notes={"plan": plan.as_dict(), **notes},
+            notes={
+                "plan": plan.as_dict(),
+                **notes,
+                **({"shortened": list(shortened)} if shortened else {}),
+            },
             files=(),
             segments=(),
         )
@@ -124,20 +135,6 @@ class Journal:
     def done(self) -> frozenset[str]:
         """Names of the completed tasks."""
         return frozenset(each.task for each in self._tasks if each.complete)
-
-    @property
-    def date(self) -> str:
-        """Date and time of the start, ISO 8601."""
-        return self._about.date or ""
-
-    @property
-    def identity(self) -> Identity | None:
-        """Identity of the drive during the measurement."""
-        return self._about.drive
-
-    @property
-    def notes(self) -> dict[str, Any]:
-        return dict(self._about.notes)
 
     def begin_session(self) -> None:
         """Starts a session, because the encoders may have lost their zeros since the last task."""
@@ -219,12 +216,11 @@ def fault_notes_in(folders: Iterable[Path]) -> tuple[str, ...]:
     found = []
     for folder in folders:
         if (folder / ABOUT_NAME).exists():
-            notes = read_yaml(folder / ABOUT_NAME).validate(RecordingFile).notes
-            tasks = _Notes.model_validate({"plan": {}, **notes}).tasks if "plan" in notes else ()
+            tasks = tasks_of(read_yaml(folder / ABOUT_NAME).validate(RecordingFile))
             found += [(f"{folder.name}/{each.file}", each.survived) for each in tasks]
     return tuple(fault_notes(found))
 
 
-def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:
+def tasks_of(recording: Recording | RecordingFile) -> tuple[TaskEntry, ...]:
     """Returns the tasks of a calibration's recording; empty for any other recording."""
     return _Notes.model_validate({"plan": {}, **recording.notes}).tasks if "plan" in recording.notes else ()

@@ -3,16 +3,19 @@
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.journal import Journal
-from hdbridge.control.bench import Bench, axis_view, lost_channels
+from hdbridge.control.bench import Bench, Run, axis_view, lost_channels
+from hdbridge.control.compensation import Compensation
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 from hdbridge.files.atomic import make_folder
+from hdbridge.files.outputs import writing
+from hdbridge.motion.procedures.moves import Outcome, Procedure
 from hdbridge.motion.procedures.plan import Plan, Task
 from hdbridge.motion.procedures.rehearsal import total_duration_s
 
@@ -36,13 +39,14 @@ SILENT: Final = Callbacks()
 
 
 class Pace:
-    """Progress of a measurement in control cycles; a bench calls `interrupted` once per cycle."""
+    """Progress of a measurement of ``total_s`` on a drive; a bench calls `interrupted` once per cycle."""
 
-    def __init__(self, total_s: float, period_s: float, callbacks: Callbacks) -> None:
+    def __init__(self, drive: Drive, total_s: float, callbacks: Callbacks) -> None:
         self.name = ""
         self.total_s = total_s
+        self._drive = drive
         self._done_s = 0.0
-        self._period_s = period_s
+        self._period_s = drive.axis.drive.cycle_s
         self._callbacks = callbacks
         self._cycles = 0
 
@@ -50,6 +54,24 @@ class Pace:
         """Starts a task."""
         self.name = name
         self._say()
+
+    def run(
+        self,
+        name: str,
+        procedure: Procedure[Outcome],
+        compensation: Compensation | TransmissionModel,
+        path: Path | None = None,
+    ) -> Run[Outcome]:
+        """Runs a procedure with a compensation; writes its samples to ``path``, even if it is stopped."""
+        self.begin(name)
+        bench = Bench(self._drive, compensation, interrupted=self.interrupted)
+        try:
+            return bench.run(procedure)
+        finally:
+            if path is not None and len(record := bench.record()):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with writing():
+                    record.write_csv(path)
 
     def interrupted(self) -> bool:
         """Counts a cycle and reports progress; returns True if the axis must stop."""
@@ -82,25 +104,6 @@ def remaining_plan(plan: Plan, axis: AxisConfig, done: Sequence[str] | frozenset
     return RemainingPlan(left, total_duration_s((each.procedure for each in left), view), fitted.notes)
 
 
-def start_journal(
-    folder: Path,
-    axis: AxisConfig,
-    plan: Plan,
-    date: datetime,
-    identity: Identity,
-    notes: dict[str, Any] | None = None,
-) -> Journal:
-    """Creates a journal, whose notes list the parts of the plan that are shortened for this axis.
-
-    InputError if the axis has no encoder at its load.
-    """
-    axis.require_load_encoder()
-    notes = dict(notes or {})
-    if shortened := remaining_plan(plan, axis).notes:
-        notes["shortened"] = list(shortened)
-    return Journal.create(folder, axis, plan, date, identity, notes)
-
-
 def measure(drive: Drive, journal: Journal, callbacks: Callbacks = SILENT) -> None:
     """Runs the remaining tasks of the journal's plan on a booted drive.
 
@@ -112,7 +115,7 @@ def measure(drive: Drive, journal: Journal, callbacks: Callbacks = SILENT) -> No
     if not left.tasks:
         return
     make_folder(journal.folder)  # fails on an unwritable disk before the axis moves
-    pace = Pace(left.duration_s, drive.axis.drive.cycle_s, callbacks)
+    pace = Pace(drive, left.duration_s, callbacks)
     bench = Bench(drive, interrupted=pace.interrupted)
     journal.begin_session()
     for task in left.tasks:

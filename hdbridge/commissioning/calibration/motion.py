@@ -32,12 +32,11 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
 from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, Pace
 from hdbridge.commissioning.calibration.path import PathError, inertia_over_stiffness, path_errors
-from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.even_speed import SHARES, EvenRun, EvenSpeed
-from hdbridge.motion.procedures.moves import Outcome, Procedure
 from hdbridge.motion.procedures.path_test import PathRun, PathTest
 from hdbridge.motion.procedures.rehearsal import total_duration_s
 from hdbridge.units import ARCSEC_PER_DEG
@@ -364,16 +363,15 @@ class _Runner:
         self.procedure = EvenSpeed.spread(axis_view(axis), shares)
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(self.motor_orders)),))
         self.ratio = model.ratio
-        self._drive = drive
-        self._pace = Pace(motion_test_s(axis), axis.drive.cycle_s, callbacks)
+        self._pace = Pace(drive, motion_test_s(axis), callbacks)
 
     def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
         """Runs the axis at all speeds with this model's correction; returns the harmonics of each run."""
-        return self._harmonics(self._run(name, model, self.procedure))
+        return self._harmonics(self._pace.run(name, self.procedure, model).outcome)
 
     def check(self, model: TransmissionModel) -> tuple[tuple[Harmonics, ...], ServoCheck]:
         """Runs the axis at all speeds with a model; compares the motor's response with the model's."""
-        stored, runs = model.response, self._run("filtered correction", model, self.procedure)
+        stored, runs = model.response, self._pace.run("filtered correction", self.procedure, model).outcome
         assert stored is not None
         answers = Answers(stored, self.motor_orders, self.ratio)
         for run in runs:
@@ -382,11 +380,6 @@ class _Runner:
         found = self._harmonics(runs)
         lag_ms = 1000.0 * following_lag_s(found)
         return found, ServoCheck(stored.following_lag_ms, lag_ms, answers.difference)
-
-    def _run(self, name: str, model: TransmissionModel, procedure: Procedure[Outcome]) -> Outcome:
-        self._pace.begin(name)
-        bench = Bench(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
-        return bench.run(procedure).outcome
 
     def _harmonics(self, runs: tuple[EvenRun, ...]) -> tuple[Harmonics, ...]:
         if self.axis.load_encoder.is_motor_encoder:
@@ -408,7 +401,7 @@ class _Runner:
 
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
         """Runs the paths with this model."""
-        return self._run("path error", model, PathTest())
+        return self._pace.run("path error", PathTest(), model).outcome
 
 
 def wind_up_of(model: TransmissionModel) -> InertialWindup | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,10 @@ from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, Pace
 from hdbridge.commissioning.calibration.path import SETTLED_ARCSEC
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.commissioning.evaluation.stepping import Stepped, quantisation_floor_arcsec
-from hdbridge.control.bench import Bench, Run, axis_view, compensation_for
+from hdbridge.control.bench import Run, axis_view
 from hdbridge.control.faultcounts import fault_notes
 from hdbridge.drive.drive import Drive
-from hdbridge.files.outputs import writing
-from hdbridge.motion.procedures.moves import Settle
+from hdbridge.motion.procedures.moves import Outcome, Procedure, Settle
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.motion.procedures.stepping import SteppingOutcome
@@ -180,38 +178,33 @@ def validate(
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
     positioning = plan.positioning(axis_view(axis))
-    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, callbacks)
+    pace = Pace(drive, validation_s(plan, axis), callbacks)
     results: list[Stepped] = []
     accuracies: list[AxisAccuracy] = []
     notes: list[str] = []
     model = before or TransmissionModel(axis.gear.ratio)
 
-    def stepped(name: str, model: TransmissionModel) -> tuple[Bench, Run[SteppingOutcome]]:
-        pace.begin(f"stepping {name}")
-        bench = Bench(drive, compensation_for(axis, model), interrupted=pace.interrupted)
-        with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
-            return bench, bench.run(stepping)
+    def run(test: str, procedure: Procedure[Outcome]) -> Run[Outcome]:
+        return pace.run(test, procedure, model, folder / f"{test.replace(' ', '-')}.csv.gz")
 
     for name, words in (
         ("before", "the active model" if before else "no compensation"),
         ("after", "the new model"),
     ):
-        bench, run = stepped(name, model)
-        test = Stepped.of(words, run.outcome)
+        steps = run(f"stepping {name}", stepping)
+        test = Stepped.of(words, steps.outcome)
         # The hysteresis at rest depends on the overshoot of the arriving motor. A compensated wind-up
         # changes it: the means of the two directions differ then.
         if name == "after" and _exceeds(test.pooled.three_sigma_arcsec, _within_directions(test), test):
-            model = at_rest(model, run)
-            bench, run = stepped(name, model)
-            test = Stepped.of(words, run.outcome)
+            model = at_rest(model, steps)
+            steps = run(f"stepping {name}", stepping)
+            test = Stepped.of(words, steps.outcome)
         results.append(test)
-        notes += fault_notes([(f"stepping {name}", run.fault_counts)])
+        notes += fault_notes([(f"stepping {name}", steps.fault_counts)])
         if name == "after" and _exceeds(_within_directions(test), floor.three_sigma_arcsec, test):
-            notes += _turning_back(run, axis)
+            notes += _turning_back(steps, axis)
         if positioning:
-            pace.begin(f"positioning {name}")
-            with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
-                measured = bench.run(positioning)
+            measured = run(f"positioning {name}", positioning)
             approaches = measured.outcome
             notes += fault_notes([(f"positioning {name}", measured.fault_counts)])
             accuracies.append(
@@ -222,7 +215,7 @@ def validate(
                 )
             )
         if name == "before":
-            model = at_rest(after, run)
+            model = at_rest(after, steps)
     accurate = (accuracies[0], accuracies[1]) if accuracies else (None, None)
     return Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(notes)), model
 
@@ -276,16 +269,3 @@ def at_rest(model: TransmissionModel, run: Run[SteppingOutcome]) -> Transmission
     change = np.linalg.lstsq(columns, error, rcond=None)[0][0]
     resting = loop.fitted(loop.coefficients() + change)
     return replace(model, effects=tuple(resting if each is loop else each for each in model.effects))
-
-
-@contextmanager
-def record_kept(bench: Bench, path: Path) -> Iterator[None]:
-    """Writes the bench's record to ``path`` on exit, even if the run is stopped."""
-    try:
-        yield
-    finally:
-        record = bench.record()
-        if len(record):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with writing():
-                record.write_csv(path)

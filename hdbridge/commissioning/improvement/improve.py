@@ -1,6 +1,6 @@
 """Runs a complete improvement, from a booted drive to a pending model that positions better."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -11,7 +11,7 @@ from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import provenance
 from hdbridge.commissioning.calibration.journal import Journal, check_is_of, fault_notes_in, tasks_of
-from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure, start_journal
+from hdbridge.commissioning.calibration.measure import SILENT, Callbacks, measure
 from hdbridge.commissioning.calibration.pipeline import Offer, proposed, save_result
 from hdbridge.commissioning.calibration.validation import floor_of
 from hdbridge.commissioning.improvement.extension import Extension, alternatives, extension_of, named
@@ -124,25 +124,38 @@ def improve(
     compensated, or without a gain both on held-out data and in stepping. Raises `InputError` if model or
     recordings belong to another axis or drive.
     """
-    active.check_bound_to(drive.axis, drive.identity)
-    drive.axis.require_load_encoder()
-    bench, notify = _Bench(drive, date, callbacks), callbacks.notify
-    earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
-    recordings, apart = _begin(source, bench)
+    axis, notify = drive.axis, callbacks.notify
+    active.check_bound_to(axis, drive.identity)
+    axis.require_load_encoder()
+    first = source.journal
+    earlier = first is None or bool(first.done)  # measured before the drive was booted
+    if first is not None:
+        apart = _measured(drive, first, callbacks)
+        recordings = {first.folder: first.recording()}
+        plans = [first.plan]
+    else:
+        recordings, apart = dict(source.given), source.independent_zeros
+        for path, recording in recordings.items():
+            check_is_of(recording, axis, path, "run 'hdbridge improve' for the axis that was recorded")
+        notes = [each.notes for each in recordings.values()]
+        plans = [Plan.model_validate(each["plan"]) for each in notes if "plan" in each]
     notify("diagnosing")
     diagnosis = diagnose(recordings, active, independent_zeros=apart)
-    view = axis_view(drive.axis)
-    plans = _plans_of(source, recordings.values())
+    view = axis_view(axis)
     rivals = unseparated(diagnosis, active, view, plans)
     found: list[Round] = []
     while len(found) < rounds:
         folder = source.folder / f"round-{len(found) + 1}"
-        journal, pairs = _journal(folder, bench, diagnosis, rivals, active, plans)
-        if journal is None:
+        if (folder / ABOUT_NAME).exists():  # resumed
+            journal, pairs = Journal.open(folder), tuple[str, ...]()
+        elif choice := choose(diagnosis, rivals, active, view, [each.name for each in plans]):
+            journal = Journal.create(folder, axis, choice.plan, date, drive.identity)
+            pairs = choice.separates
+        else:
             break
         notify(diagnosis.verdict())
         notify(f"round {len(found) + 1}: {journal.plan.about}, to separate {', '.join(pairs) or 'the rest'}")
-        apart = bench.run(journal) or apart or earlier
+        apart = _measured(drive, journal, callbacks) or apart or earlier
         recordings[folder] = journal.recording()
         diagnosis = diagnose(recordings, active, independent_zeros=apart)
         plans.append(journal.plan)
@@ -150,7 +163,7 @@ def improve(
         left = tuple(map(alternatives, diagnosis.findings))
         found.append(Round(journal.plan.name, journal.plan.about, str(folder), pairs, left))
     result = Improvement(
-        axis=drive.axis.name,
+        axis=axis.name,
         recordings=tuple(map(str, recordings)),
         date=next(iter(recordings.values())).date,
         plan=source.plan.name,
@@ -167,71 +180,30 @@ def improve(
     )
     if diagnosis.findings:
         whole = Recording.joined(list(recordings.values()))
-        result = _concluded(result, bench, source, profile, whole)
-    return _kept(source.folder, result)
+        result = _concluded(result, drive, source, profile, whole, date, callbacks)
+    if source.folder.is_dir() and any(source.folder.iterdir()):  # something new was measured
+        model = result.extension.model if diagnosis.findings else None
+        save_result(source.folder / RESULT_NAME, result.as_dict(), model, active)
+    return result
 
 
-@dataclass(frozen=True, slots=True)
-class _Bench:
-    """Drive, date and callbacks shared by all measurements of an improvement."""
-
-    drive: Drive
-    date: datetime
-    callbacks: Callbacks
-
-    def run(self, journal: Journal) -> bool:
-        """Runs the missing measurements; returns True if an encoder may have lost its zero between tasks."""
-        measure(self.drive, journal, self.callbacks)
-        return len({each.session for each in tasks_of(journal.recording())}) > 1
-
-
-def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
-    """Returns the first recordings to diagnose, and True if an encoder may have lost its zero in between."""
-    if source.journal is not None:
-        apart = bench.run(source.journal)
-        return {source.journal.folder: source.journal.recording()}, apart
-    for path, recording in source.given.items():
-        remedy = "run 'hdbridge improve' for the axis that was recorded"
-        check_is_of(recording, bench.drive.axis, path, remedy)
-    return dict(source.given), source.independent_zeros
-
-
-def _plans_of(source: Source, given: Iterable[Recording]) -> list[Plan]:
-    """Returns the plans used for measuring, as far as known."""
-    if source.journal is not None:
-        return [source.journal.plan]
-    return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
-
-
-def _journal(
-    folder: Path,
-    bench: _Bench,
-    diagnosis: Diagnosis,
-    rivals: Mapping[str, Sequence[str]],
-    active: TransmissionModel,
-    plans: Sequence[Plan],
-) -> tuple[Journal | None, tuple[str, ...]]:
-    """Returns the journal of the next experiment, and the alternatives that it separates.
-
-    An experiment already in ``folder`` is resumed, otherwise the most useful one is chosen. The
-    journal is None if no experiment separates any alternatives.
-    """
-    axis = bench.drive.axis
-    if (folder / ABOUT_NAME).exists():
-        journal = Journal.open(folder)
-        journal.check_is_of(axis, bench.drive.identity)
-        return journal, ()
-    choice = choose(diagnosis, rivals, active, axis_view(axis), [each.name for each in plans])
-    if choice is None:
-        return None, ()
-    return start_journal(folder, axis, choice.plan, bench.date, bench.drive.identity), choice.separates
+def _measured(drive: Drive, journal: Journal, callbacks: Callbacks) -> bool:
+    """Runs the missing measurements; returns True if an encoder may have lost its zero between tasks."""
+    measure(drive, journal, callbacks)
+    return len({each.session for each in tasks_of(journal.recording())}) > 1
 
 
 def _concluded(
-    result: Improvement, bench: _Bench, source: Source, profile: Path, recording: Recording
+    result: Improvement,
+    drive: Drive,
+    source: Source,
+    profile: Path,
+    recording: Recording,
+    date: datetime,
+    callbacks: Callbacks,
 ) -> Improvement:
     """Returns the result with the trial, if the extended model may be offered, and with the offer."""
-    extension, drive, notify = result.extension, bench.drive, bench.callbacks.notify
+    extension, notify = result.extension, callbacks.notify
     if not extension.carried:
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
     if not extension.improves:
@@ -242,7 +214,7 @@ def _concluded(
     notify("stepping with the active and the extended model alternately")
     floor = floor_of(drive.axis, recording)
     try:
-        trial = run_trial(drive, source.plan, result.active, model, floor, source.folder, bench.callbacks)
+        trial = run_trial(drive, source.plan, result.active, model, floor, source.folder, callbacks)
     except InputError as problem:
         return replace(result, offer=Offer(False, f"not offered: {problem}"))
     result = replace(result, trial=trial)
@@ -252,7 +224,7 @@ def _concluded(
             result, offer=Offer(False, f"not offered: positioning is not more accurate, {summary}")
         )
     reason = f"improvement {source.folder.name}: {named(extension.carried)}; {summary}"
-    return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
+    return replace(result, offer=proposed(profile, model, reason, date, drive))
 
 
 def _summary(trial: Trial) -> str:
@@ -283,11 +255,3 @@ def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
         for each in result.diagnosis.findings
     ]
     return {**provenance(result.recordings, [recording], held_out), "found": found}
-
-
-def _kept(folder: Path, result: Improvement) -> Improvement:
-    """Saves result and models next to the recording, unless nothing new was measured."""
-    if folder.is_dir() and any(folder.iterdir()):
-        model = result.extension.model if result.diagnosis.findings else None
-        save_result(folder / RESULT_NAME, result.as_dict(), model, result.active)
-    return result

@@ -16,11 +16,10 @@ from hdbridge.commissioning.calibration.validation import (
     CHANCE,
     Floor,
     Validation,
-    record_kept,
     worse_ways,
 )
 from hdbridge.commissioning.evaluation.stepping import Stepped
-from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.faultcounts import FaultCount, fault_notes
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.moves import AxisView
@@ -94,18 +93,16 @@ def run_trial(
     axis = drive.axis
     compensations = [compensation_for(axis, each) for each in (active, model)]
     procedures = _procedures(plan, axis_view(axis), active)
-    pace = Pace(trial_s(plan, axis, active), axis.drive.cycle_s, callbacks)
+    pace = Pace(drive, trial_s(plan, axis, active), callbacks)
     outcomes: tuple[list[SteppingOutcome], list[SteppingOutcome]] = ([], [])
     fault_counts: list[tuple[str, tuple[FaultCount, ...]]] = []
     for number, (name, procedure) in enumerate(procedures):
         for which in (0, 1) if number % 2 == 0 else (1, 0):
             title = f"{name}-{'before' if which == 0 else 'after'}"
-            pace.begin(title.replace("-", " "))
-            bench = Bench(drive, compensations[which], interrupted=pace.interrupted)
-            with record_kept(bench, folder / f"{title}.csv.gz"):
-                run = bench.run(procedure)
-                outcomes[which].append(run.outcome)
-                fault_counts.append((title, run.fault_counts))
+            path = folder / f"{title}.csv.gz"
+            run = pace.run(title.replace("-", " "), procedure, compensations[which], path)
+            outcomes[which].append(run.outcome)
+            fault_counts.append((title, run.fault_counts))
     pieces = [Stepped.of(words, _together(each[:-1])) for words, each in zip(_WORDS, outcomes, strict=True)]
     small = [Stepped.of(words, each[-1]) for words, each in zip(_WORDS, outcomes, strict=True)]
     stepping = Validation(pieces[0], pieces[1], floor, fault_notes=tuple(fault_notes(fault_counts)))
