@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.control.faultcounts import FaultCount, fault_notes
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder
 from hdbridge.files.yamlfile import read_yaml
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record
@@ -78,11 +79,12 @@ class Journal:
         identity: Identity,
         notes: dict[str, Any],
     ) -> Self:
-        """Creates a journal, written with its first task. InputError if the folder contains a recording."""
+        """Creates folder and journal, written with its first task. InputError if there is a recording."""
         if (folder / ABOUT_NAME).exists():
             raise InputError(
                 f"{folder}: already contains a recording; expected a new folder, or --resume to continue it"
             )
+        make_folder(folder)
         about = RecordingFile.made(
             axis=axis.name,
             ratio=axis.gear.ratio,
@@ -161,7 +163,6 @@ class Journal:
         shift_s = end_s + PAUSE_S - float(record.time_s[0])
         if shift_s:
             record = Record({**record.columns, "time_s": record.time_s + shift_s})
-        self.folder.mkdir(parents=True, exist_ok=True)
         again = sum(each.task == task for each in self._tasks)
         name = f"{task}{f'-{again + 1}' if again else ''}.csv.gz"
         record.write_csv(self.folder / name)

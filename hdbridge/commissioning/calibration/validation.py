@@ -286,6 +286,5 @@ def record_kept(bench: Bench, path: Path) -> Iterator[None]:
     finally:
         record = bench.record()
         if len(record):
-            path.parent.mkdir(parents=True, exist_ok=True)
             with writing():
                 record.write_csv(path)
