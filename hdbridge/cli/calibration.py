@@ -16,7 +16,7 @@ from hdbridge.cli.options import taking
 from hdbridge.cli.printing import note, print_blocks, progress_bar, say, write_json, write_page, write_result
 from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError, command
-from hdbridge.files.atomic import make_folder, new_folder
+from hdbridge.files.atomic import make_folder, new_folder, sole_writer
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
@@ -122,20 +122,21 @@ class Measurement:
         from hdbridge.axis.model.store import measuring
         from hdbridge.commissioning.calibration import Callbacks
 
-        try:
-            with (
-                measuring(self.session.files.axis),
-                self.session.booted() as (drive, interrupted),
-                phases() as progress,
-            ):
-                yield drive, Callbacks(progress, interrupted, note)
-        except BaseException:
-            if (self.folder / "recording.yaml").exists():
-                note(f"the measured data are kept; continue with --resume {self.folder}")
-            raise
-        finally:
-            with suppress(OSError):
-                self.folder.rmdir()
+        with sole_writer(self.folder, new=self.journal is None):
+            try:
+                with (
+                    measuring(self.session.files.axis),
+                    self.session.booted() as (drive, interrupted),
+                    phases() as progress,
+                ):
+                    yield drive, Callbacks(progress, interrupted, note)
+            except BaseException:
+                if (self.folder / "recording.yaml").exists():
+                    note(f"the measured data are kept; continue with --resume {self.folder}")
+                raise
+            finally:
+                with suppress(OSError):
+                    self.folder.rmdir()
 
 
 @contextmanager

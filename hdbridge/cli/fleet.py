@@ -17,6 +17,7 @@ from hdbridge.cli.options import need_extra, taking
 from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_page
 from hdbridge.cli.session import deferred_interrupt
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import sole_writer
 from hdbridge.files.expectation import nearest
 from hdbridge.files.outputs import Kind
 
@@ -260,7 +261,7 @@ def simulate(
     """
     from hdbridge.fleet.simulate import simulate as make
 
-    with progress_bar() as bar:
+    with sole_writer(folder), progress_bar() as bar:
         task = bar.add_task("simulating", total=1.0)
         make(folder, joints, recordings, seed, lambda share: bar.update(task, completed=share))
     say(f"{folder}: {joints} joints with {recordings} recordings each")

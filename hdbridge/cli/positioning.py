@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from datetime import datetime
 from itertools import accumulate
 from pathlib import Path
@@ -17,7 +17,7 @@ from hdbridge.cli.printing import note, print_blocks, print_table, progress_bar,
 from hdbridge.cli.session import Session, note_clamped, on_axis
 from hdbridge.enums import Scheme
 from hdbridge.errors import HdbridgeError, InputError, command
-from hdbridge.files.atomic import make_folder, new_folder
+from hdbridge.files.atomic import make_folder, new_folder, sole_writer
 from hdbridge.files.outputs import Kind, writing
 from hdbridge.files.profile import Profile, no_model
 
@@ -227,9 +227,6 @@ def run_comparison(
     wanted = tuple(schemes) if schemes else offered
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
         raise InputError("--scheme extended: the model has no effect beyond its two parts; leave it out")
-    if record is not None:
-        make_folder(record)  # an error is reported before the axis moves
-
     for each in wanted:
         compensation_for(axis, each.of(model))  # refused before anything is connected
     if remark := cap_remark(axis, model):
@@ -246,8 +243,9 @@ def run_comparison(
         seconds = float(measured.time_s[-1] - measured.time_s[0])
         note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
 
+    alone = nullcontext() if record is None else sole_writer(record, new=True)
     try:
-        with session.booted() as (drive, interrupted), progress_bar() as bar:
+        with alone, session.booted() as (drive, interrupted), progress_bar() as bar:
             bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
             begun: set[Scheme] = set()
 

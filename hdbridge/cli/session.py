@@ -152,9 +152,10 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Defers termination signals: within the block they only set a flag, which the yielded function returns.
 
     A closed terminal (SIGHUP) or SIGQUIT therefore also stops the axis in an orderly way. A signal that was
-    ignored from the start (`nohup`) stays ignored. The third signal interrupts at once.
+    ignored from the start (`nohup`) stays ignored. The third signal interrupts at once. A signal after the
+    last call of the function raises KeyboardInterrupt at the end of the block.
     """
-    wishes = 0
+    wishes, seen = 0, False
 
     def note(_number: int, _frame: FrameType | None) -> None:
         nonlocal wishes
@@ -162,8 +163,15 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
         if wishes >= 3:  # the user insists: end even if the program hangs
             raise KeyboardInterrupt
 
+    def asked() -> bool:
+        nonlocal seen
+        seen = seen or wishes > 0
+        return seen
+
     with handling(note, signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        yield lambda: wishes > 0
+        yield asked
+    if wishes and not seen:
+        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -15,6 +15,8 @@ from typing import Final
 from hdbridge.files.logformat import ForMachines, ForPeople, LogFile
 
 _ROOT = logging.getLogger("hdbridge")
+_ALL = logging.getLogger()
+"""Logger of all libraries, of which only warnings and errors are logged."""
 BURST: Final = 20
 """Maximum number of records of one event per `WINDOW_S`; the number of omitted records is reported."""
 WINDOW_S: Final = 10.0
@@ -79,12 +81,14 @@ def begin_log(settings: LogSettings) -> None:
     stderr.setFormatter(_Journal() if to_journal else ForPeople() if sys.stderr.isatty() else ForMachines())
     stderr.setLevel(logging.DEBUG if settings.verbose else logging.INFO)
     stderr.addFilter(RateLimit())
-    _ROOT.addHandler(stderr)
+    for each in (_ROOT, _ALL):
+        each.addHandler(stderr)
     if settings.file is not None:
         file = LogFile(settings.file, encoding="utf-8")
         file.setFormatter(ForMachines())
         file.addFilter(RateLimit())
-        _ROOT.addHandler(file)
+        for each in (_ROOT, _ALL):
+            each.addHandler(file)
     _ROOT.setLevel(logging.DEBUG)
 
 
@@ -95,5 +99,6 @@ def log_once(settings: LogSettings, where: str, event: str, facts: dict[str, obj
     logging.getLogger(where).info(event, facts)
     for each in set(_ROOT.handlers) - set(before):
         _ROOT.removeHandler(each)
+        _ALL.removeHandler(each)
         each.close()
     _ROOT.setLevel(logging.CRITICAL)

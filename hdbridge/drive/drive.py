@@ -200,7 +200,9 @@ class Drive:
         self._mode = mode
         if (node_id := self.monitor.restarted) is not None:
             raise TransitionError(
-                f"node {node_id} on {self.link.name}: has restarted since it was verified; call boot() again"
+                f"node {node_id} on {self.link.name}: has restarted (boot-up message) since it was "
+                "verified; run the command again, which boots it (in the library: boot()), and if it recurs, "
+                "check its supply"
             )
         return positions
 

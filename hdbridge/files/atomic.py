@@ -19,6 +19,7 @@ from typing import BinaryIO
 
 from hdbridge.errors import InputError, OutputError
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 
@@ -57,7 +58,7 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
 
 
 def check_writable(path: Path | str, named: Path | str = "") -> None:
-    """Raises `InputError` if a file cannot be written here; to be called before a long measurement.
+    """Raises an error if a file cannot be written here; to be called before a long measurement.
 
     The message names ``named`` in place of the path, if given.
 
@@ -87,7 +88,7 @@ def check_writable(path: Path | str, named: Path | str = "") -> None:
             raise InputError(f"{named}: cannot be written: the folder {target.parent} does not permit it")
         _try_out(target)
     except OSError as problem:
-        raise InputError(f"{named}: cannot be written: {problem.strerror}") from None
+        raise _refused(f"{named}: cannot be written", problem) from None
     except RuntimeError:  # Python 3.11 and 3.12 report a loop of symbolic links by this
         raise InputError(f"{named}: cannot be written: its symbolic links form a loop") from None
 
@@ -141,18 +142,62 @@ def _write_all(descriptor: int, data: bytes) -> None:
         written += os.write(descriptor, data[written:])
 
 
-def make_folder(path: Path | str) -> Path:
-    """Creates a folder with its parents and returns it; raises `InputError` if it is not writable."""
+def make_folder(path: Path | str, *, new: bool = False) -> Path:
+    """Creates a folder with its parents and returns it; with ``new``, raises `FileExistsError` if it exists.
+
+    Raises `OutputError` if the disk is full, and `InputError` if the folder is not writable. A folder that
+    takes no files is removed again.
+    """
     folder = Path(path)
+    found, doing = folder.exists(), "create"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise InputError(f"{path}: cannot create this folder: {problem.strerror}") from None
-    try:
+        folder.mkdir(parents=True, exist_ok=not new)
+        doing = "write into"
         _try_out(folder.resolve() / "tried")
     except OSError as problem:
-        raise InputError(f"{path}: cannot write into this folder: {problem.strerror}") from None
+        if new and isinstance(problem, FileExistsError):
+            raise
+        if not found:
+            with suppress(OSError):
+                folder.rmdir()
+        raise _refused(f"{path}: cannot {doing} this folder", problem) from None
     return folder
+
+
+def _refused(what: str, problem: OSError) -> InputError | OutputError:
+    """Returns the error for a location that takes no file: an `OutputError` if the disk is full."""
+    kind = OutputError if problem.errno in _FULL else InputError
+    return kind(f"{what}: {problem.strerror}")
+
+
+@contextmanager
+def sole_writer(folder: Path, *, new: bool = False) -> Iterator[None]:
+    """Creates a folder in which only this process may write its results; the lock ends with the process.
+
+    Raises `InputError` at once if another process holds the lock, if the folder is not writable, or, with
+    ``new``, if it is not empty.
+    """
+    make_folder(folder)
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as problem:
+        raise InputError(f"{folder}: cannot be opened: {problem.strerror}") from None
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            free = _is_still(folder, descriptor)  # otherwise its last writer has removed it, empty
+        except BlockingIOError:
+            free = False
+        if not free:
+            raise InputError(
+                f"{folder}: another hdbridge process writes to this folder; wait until it ends, or take "
+                "another folder"
+            )
+        if new and any(folder.iterdir()):
+            raise InputError(f"{folder}: is not empty any more; expected a new or an empty folder")
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
@@ -184,7 +229,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
         if not isinstance(problem, OSError):
             raise
         if place == folder:
-            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
+            raise _refused(f"{folder}: cannot create this folder", problem) from None
         raise OutputError(f"{place}: cannot be written: {problem.strerror}") from None
     return [folder / name for name in files]
 
@@ -194,16 +239,9 @@ def new_folder(path: Path) -> Path:
 
     Concurrent processes always receive different folders.
     """
-    make_folder(path.parent)
     for number in itertools.count(1):
-        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            continue
-        except OSError as problem:
-            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
-        return folder
+        with suppress(FileExistsError):
+            return make_folder(path if number == 1 else path.with_name(f"{path.name}-{number}"), new=True)
     raise AssertionError("numbers do not end")
 
 

@@ -15,7 +15,7 @@ class ForPeople(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         facts = " ".join(f"{name}={value}" for name, value in _facts(record).items())
-        return f"{_date(record):%H:%M:%S}.{int(record.msecs):03d} {record.msg}  {facts}".rstrip()
+        return f"{_date(record):%H:%M:%S}.{int(record.msecs):03d} {_event(record)}  {facts}".rstrip()
 
 
 class ForMachines(logging.Formatter):
@@ -26,7 +26,7 @@ class ForMachines(logging.Formatter):
             "date": _date(record).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "where": record.name,
-            "event": record.msg,
+            "event": _event(record),
         }
         return json.dumps({**about, **_facts(record)}, default=str)
 
@@ -56,8 +56,16 @@ class LogFile(logging.FileHandler):
             print(f"hdbridge: {self.baseFilename}: cannot be written: {why}", file=sys.stderr)
 
 
+def _event(record: logging.LogRecord) -> str:
+    """Returns the event's name; of a record of another library, its message."""
+    return str(record.msg) if record.name.startswith("hdbridge") else record.getMessage()
+
+
 def _facts(record: logging.LogRecord) -> dict[str, object]:
-    return dict(record.args) if isinstance(record.args, dict) else {}
+    facts = dict(record.args) if isinstance(record.args, dict) else {}
+    if record.exc_info:
+        facts["traceback"] = logging.Formatter().formatException(record.exc_info)
+    return facts
 
 
 def _date(record: logging.LogRecord) -> datetime:

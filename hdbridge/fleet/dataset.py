@@ -8,8 +8,6 @@ which are a contract.
 
 from __future__ import annotations
 
-import fcntl
-import os
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.files.atomic import make_folder, sole_writer, write_atomically
 from hdbridge.fleet.sources import Stored
 
 if TYPE_CHECKING:
@@ -150,17 +148,8 @@ class Dataset:
     def locked(self) -> Iterator[None]:
         """Creates the folder and allows one writer at a time; the lock ends with its process."""
         self.create()
-        folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{self.folder}: another hdbridge fleet writes to this folder; wait until it ends, or stop it"
-            ) from None
-        else:
+        with sole_writer(self.folder):
             yield
-        finally:
-            os.close(folder)
 
     def stored(self) -> Stored:
         """Returns the rows of all recordings with only the columns that a run needs."""

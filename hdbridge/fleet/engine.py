@@ -21,7 +21,7 @@ from urllib.parse import quote
 
 from hdbridge import __version__
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
+from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.fleet.dataset import Dataset
 from hdbridge.fleet.diagnosing import NO_MEMORY, Model, Row, axes_of, diagnosed, fitted, local_model, lost
 from hdbridge.fleet.sources import Source, Stored, with_axes
@@ -298,7 +298,7 @@ class _Run:
             joint, _, kept = to_fit[place]
             found[joint] = made or Model(reason=f"no model could be fitted: {KILLED}")
             if not found[joint].reason:
-                folder.mkdir(exist_ok=True)
+                make_folder(folder)
                 write_atomically(kept, found[joint].text)
         self._total = total
         return found

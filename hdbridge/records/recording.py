@@ -23,6 +23,7 @@ from pydantic import Field, model_validator
 
 from hdbridge.axis import Identity
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically, wrong
 from hdbridge.records.columns import CsvColumns, Said
 from hdbridge.records.record import Record, concatenate, time_shifts_s
@@ -181,10 +182,7 @@ class Recording:
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
             raise InputError(f"{folder}: already contains a recording; expected a new folder")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as problem:
-            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
+        make_folder(folder)
         parts = self.record.parts()
         files = []
         for number, part in enumerate(parts, 1):

@@ -1,6 +1,8 @@
 """`hdbridge doctor` as a person uses it."""
 
 import json
+import logging
+import signal
 from dataclasses import replace
 
 from hdbridge.cli.session import Session
@@ -42,3 +44,29 @@ def test_a_real_axis_moves_only_with_consent(hdbridge, monkeypatch):
     assert "FAIL" not in done.stdout
     assert "motion was not confirmed" in done.stderr
     hdbridge("doctor", "article", "--yes")
+
+
+class InterruptAtPowerOff(logging.Handler):
+    """Sends SIGINT when the drive is switched off for the first time, and counts how often it is enabled."""
+
+    enabled = 0
+    sent = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        facts = record.args if isinstance(record.args, dict) else {}
+        self.enabled += record.msg == "enable"
+        off = facts.get("object") == "1016h:01" and facts.get("data") == "00 00 00 00"
+        if self.enabled and not self.sent and record.msg == "sdo write" and off:
+            self.sent = True
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_while_power_goes_off_is_followed_by_no_other_motion(hdbridge):
+    handler, log = InterruptAtPowerOff(), logging.getLogger("hdbridge.drive")
+    log.addHandler(handler)
+    try:
+        hdbridge("-vv", "doctor", "article", "--simulate", "--yes", status=130)
+    finally:
+        log.removeHandler(handler)
+    assert handler.sent
+    assert handler.enabled == 1

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 from support import patience
-from support.command import run_apart, started
+from support.command import run_apart, run_here, started
 
 from hdbridge.records.recording import Recording
 
@@ -87,6 +87,25 @@ def test_one_measurement_of_an_axis_at_a_time(hdbridge, profile, tmp_path):
     assert "another hdbridge process is measuring this axis" in done.stderr
     assert "booted" not in done.stderr
     assert not (tmp_path / "rec").exists()
+
+
+def test_a_folder_takes_the_results_of_one_process_at_a_time(tmp_path):
+    with until("booted", tmp_path, *LONG, "--record", "kept") as first:
+        for second in (
+            ("step", "article", "--simulate", "--count", 2, "--record", "kept"),
+            ("demo", "--count", 2, "--out", "kept"),
+            ("measure", "demo", "--simulate", "--out", "kept"),
+            ("calibrate", "demo", "--simulate", "--out", "kept"),
+            ("fleet", "simulate", "kept"),
+        ):
+            refused = run_here(tmp_path, *second, status=2)
+            assert "kept: another hdbridge process writes to this folder" in refused.stderr
+            assert "booted" not in refused.stderr
+        assert (tmp_path / "kept").is_dir()
+        first.send_signal(signal.SIGINT)
+        first.communicate()
+    assert first.returncode == 130
+    assert [each.name.endswith("-stopped.csv.gz") for each in (tmp_path / "kept").iterdir()] == [True]
 
 
 def test_calibrations_within_one_second_get_separate_folders(monkeypatch, tmp_path):

@@ -107,12 +107,13 @@ def test_delays_double_until_a_process_stays_alive() -> None:
 
 @pytest.fixture
 def log() -> Iterator[logging.Logger]:
-    """The project's logger, restored afterwards."""
-    root = logging.getLogger("hdbridge")
+    """The project's logger, restored afterwards, as is that of all libraries."""
+    root, others = logging.getLogger("hdbridge"), logging.getLogger()
     before = root.handlers[:], root.level, root.propagate
     yield root
     for handler in set(root.handlers) - set(before[0]):
         root.removeHandler(handler)
+        others.removeHandler(handler)
         handler.close()
     root.setLevel(before[1])
     root.propagate = before[2]
@@ -128,6 +129,21 @@ def test_the_log_is_json_without_a_terminal(log, tmp_path, capsys):
     assert [json.loads(each)["event"] for each in (tmp_path / "log").read_text().splitlines()] == [
         "begun", "detail",
     ]  # fmt: skip
+
+
+def test_an_error_of_a_library_is_one_line_of_json_as_well(log, tmp_path, capsys):
+    begin_log(LogSettings(file=tmp_path / "log"))
+    try:
+        raise ValueError("odd")
+    except ValueError:
+        logging.getLogger("some.library").exception("Exception in %s", "application")
+    (line,) = capsys.readouterr().err.splitlines()
+    event = json.loads(line)
+    assert (event["where"], event["level"], event["event"]) == (
+        "some.library", "error", "Exception in application",
+    )  # fmt: skip
+    assert "ValueError: odd" in event["traceback"]
+    assert (tmp_path / "log").read_text() == line + "\n"
 
 
 def test_the_control_process_logs_once(log: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,7 +37,7 @@ def test_a_drive_that_restarted_is_not_enabled_before_it_is_booted_again(mode: M
     with booted(starts_itself=True) as (drive, node):
         node.restart(lasts=False)
         drive.wait(0.05)
-        with pytest.raises(TransitionError, match="has restarted"):
+        with pytest.raises(TransitionError, match="run the command again"):
             drive.enable(mode)
         assert node.powered == 0
         drive.boot()

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.command import run_here
 
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.atomic import make_folder, write_folder
@@ -66,3 +67,41 @@ def test_a_new_axis_on_a_full_disk_names_its_own_file_and_leaves_nothing(tmp_pat
     assert done.returncode == 6, done.stderr
     assert f"hdbridge: {tmp_path}/cell/mine/axis.yaml: cannot be written: " in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def full_disk(tmp_path):
+    """Returns a function that makes a folder on a disk with room for this number of files and folders."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+
+    def mounted(files):
+        options = f"size=64k,nr_inodes={files + 1}"  # one is the folder itself
+        mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(disk)]
+        if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+            pytest.skip("needs the right to mount a file system")
+        return disk
+
+    yield mounted
+    subprocess.run(["umount", str(disk)], capture_output=True, check=False)
+
+
+@pytest.mark.parametrize("room", [0, 1])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("new", "mine"),
+        ("demo", "--count", 2),
+        ("step", "article", "--simulate", "--count", 2, "--scheme", "none", "--record", "kept"),
+        ("measure", "article", "--simulate", "--out", "kept"),
+        ("fleet", "simulate", "fleet"),
+    ],
+    ids=lambda asked: asked[0],
+)
+def test_a_disk_without_room_for_a_folder_is_one_error_and_nothing_is_left(full_disk, room, asked):
+    disk = full_disk(room)
+    done = run_here(disk, *asked, status=6)
+    (line,) = [each for each in done.stderr.splitlines() if each.startswith("hdbridge: ")]
+    assert "No space left on device" in line
+    assert "booted" not in done.stderr
+    assert list(disk.iterdir()) == []

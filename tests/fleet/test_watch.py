@@ -238,5 +238,5 @@ def test_ctrl_c_ends_the_command_and_keeps_finished_results(fleet, tmp_path, ver
 
 def test_two_writers_at_once_are_refused(place, here):
     dataset = Dataset(place.parent / "out")
-    with dataset.locked(), pytest.raises(InputError, match="another hdbridge fleet writes"):
+    with dataset.locked(), pytest.raises(InputError, match="another hdbridge process writes"):
         go(place, here)

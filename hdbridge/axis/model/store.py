@@ -30,7 +30,7 @@ from pydantic import Field
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import check_writable
+from hdbridge.files.atomic import check_writable, make_folder
 from hdbridge.files.yamlfile import dump_yaml, read_yaml, write_atomically
 from hdbridge.strictness import Strict
 
@@ -249,7 +249,7 @@ class Store(Generic[K]):
             try:
                 self.load(profile / self.active)
             except (InputError, UnicodeDecodeError):  # damaged by a manual edit: saved, but not as a version
-                write_atomically(self._history_folder(profile) / "unreadable.yaml", before)
+                write_atomically(make_folder(profile / self.history) / "unreadable.yaml", before)
             else:
                 reason_found = "found as the active version, but not in the history"
                 activations.append(
@@ -272,16 +272,8 @@ class Store(Generic[K]):
         number = self._number(profile, content)
         if number is None:
             number = max(self._history(profile), default=0) + 1
-            write_atomically(self._history_folder(profile) / f"{number:04d}.yaml", content)
+            write_atomically(make_folder(profile / self.history) / f"{number:04d}.yaml", content)
         return number
-
-    def _history_folder(self, profile: Path) -> Path:
-        folder = profile / self.history
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as problem:
-            raise InputError(f"{folder}: cannot create this folder: {problem.strerror}") from None
-        return folder
 
     def _check(self, profile: Path, path: Path, identity: Identity | None) -> K:
         content = self.load(path)

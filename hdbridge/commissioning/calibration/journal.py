@@ -17,6 +17,7 @@ from hdbridge.axis import AxisConfig, Identity
 from hdbridge.control.bench import axis_view
 from hdbridge.control.faultcounts import FaultCount, fault_notes
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder
 from hdbridge.files.yamlfile import read_yaml
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record
@@ -80,7 +81,8 @@ class Journal:
         identity: Identity,
         notes: Mapping[str, Any] = MappingProxyType({}),
     ) -> Self:
-        """Creates a journal, written with its first task; notes the parts of the plan that are shortened.
+        """Creates folder and journal, written with its first task; notes the parts of the plan that are
+        shortened.
 
         InputError if the folder contains a recording, or if the axis has no encoder at its load.
         """
@@ -90,6 +92,7 @@ class Journal:
                 f"{folder}: already contains a recording; expected a new folder, or --resume to continue it"
             )
         shortened = plan.tasks(axis_view(axis)).notes
+        make_folder(folder)
         about = RecordingFile.made(
             axis=axis.name,
             ratio=axis.gear.ratio,
@@ -158,7 +161,6 @@ class Journal:
         shift_s = end_s + PAUSE_S - float(record.time_s[0])
         if shift_s:
             record = Record({**record.columns, "time_s": record.time_s + shift_s})
-        self.folder.mkdir(parents=True, exist_ok=True)
         again = sum(each.task == task for each in self._tasks)
         name = f"{task}{f'-{again + 1}' if again else ''}.csv.gz"
         record.write_csv(self.folder / name)

@@ -69,7 +69,6 @@ class Pace:
             return bench.run(procedure)
         finally:
             if path is not None and len(record := bench.record()):
-                path.parent.mkdir(parents=True, exist_ok=True)
                 with writing():
                     record.write_csv(path)
 

@@ -185,10 +185,15 @@ class _WebSocket(_CheckedConnection, WebSocketsSansIOProtocol):
             super()._check()
 
 
+_NOT_LOGGED: Final = ("without completing handshake", "Invalid UTF-8", "timeout graceful shutdown")
+
+
 def _worth_logging(record: logging.LogRecord) -> bool:
-    """Returns False for records of client errors: a refused WebSocket, a message that is not UTF-8."""
-    words = record.getMessage()
-    return "without completing handshake" not in words and "Invalid UTF-8" not in words
+    """Returns False for errors of a client (a refused WebSocket, a message that is not UTF-8), and for
+    requests that the end of the server cuts off.
+    """
+    words, error = record.getMessage(), record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, asyncio.CancelledError) and not any(each in words for each in _NOT_LOGGED)
 
 
 def _client(transport: asyncio.BaseTransport) -> tuple[str, int] | None:

@@ -1,11 +1,14 @@
 """Clients that stall are disconnected after a time-out, shortened here."""
 
+import logging
 import socket
 
 import pytest
 from support.api import served
 from support.fake_bridge import FakeBridge
+from support.patience import until
 
+from hdbridge.client.messages import ControlState
 from hdbridge.daemon.api import guard, server
 
 
@@ -39,6 +42,25 @@ def test_half_a_second_request_is_closed_after_the_first_was_answered(hasty):
     whole = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
     answer = said(hasty, whole + b"GET /heal")
     assert answer.count(b"HTTP/1.1 200") == 1
+
+
+def test_a_request_cut_off_by_the_end_of_the_server_is_not_an_error(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(server, "ENDING_S", 0)
+    bridge = FakeBridge()
+    with served(bridge, tmp_path) as place, place.over_socket() as client:
+        lease = client.post("/lease", json={"client": "test"}).json()["token"]
+        axis = bridge.axes["joint-1"]
+        axis.at, axis.moving_s = ControlState.ENABLED, 1e6
+        with socket.socket(socket.AF_UNIX) as raw:
+            raw.connect(str(place.socket))
+            raw.sendall(
+                f"POST /api/v1/axes/{axis.name}/move HTTP/1.1\r\nHost: localhost\r\nX-Lease: {lease}\r\n"
+                'Content-Type: application/json\r\nContent-Length: 16\r\n\r\n{"target_deg":1}'.encode()
+            )
+            until(lambda: bridge.moved)
+            place.server.stop()
+            assert raw.recv(1000) == b""
+    assert not [each for each in caplog.records if each.levelno >= logging.WARNING]
 
 
 def test_a_missing_body_is_reported(hasty):
