@@ -19,7 +19,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import free_parameters
 from hdbridge.twin.mechanics import measured_mechanics
 from hdbridge.twin.misfit import CHANNELS, Data, Replays, Values, coarse, noise_floor, prepare
-from hdbridge.twin.naming import GROWN, OF_REPLAY, Finding, explain, findings, growth, scales_by_kind, shifted
+from hdbridge.twin.naming import GROWN, Finding, explain, findings, growth, scales_by_kind, shifted
 from hdbridge.twin.parameters import BY_NAME, Parameter, by_cause, coordinates
 from hdbridge.units import figure
 
@@ -117,7 +117,7 @@ def check(
             for cause, own in groups.items()
             if cause not in settled and not _shows(replays, twin, own, was)
         )
-        found = explain(replays, twin, parameters, was, progress, OF_REPLAY if ratio else 0.0, shown)
+        found = explain(replays, twin, parameters, was, progress, shown, ratio=ratio)
     changes = findings(found, groups, twin, ratio=ratio)
     blind = len(unseen) == len(groups)
     unseen = tuple(each for each in unseen if each not in found.causes)

@@ -355,6 +355,8 @@ class Fitted:
     """True if the fit was ended before it reached a minimum."""
     rough: bool = False
     """True if the fit minimises `misfit`, so that its values are not the most likely ones."""
+    visited: tuple[tuple[FloatArray, float], ...] = ()
+    """Other places to which a fit of the same parameters has led, which are not better, with their losses."""
 
     @property
     def cost(self) -> float:
@@ -692,10 +694,6 @@ SERVOS: Final = (
     "position gain", "velocity gain", "integral time", "command filter", "velocity feed-forward",
     "servo dead time", "speed filter", "torque filter", "load encoder delay",
 )  # fmt: skip
-EQUAL_MOTORS: Final = 4.0
-"""Maximum ratio of the motor's inertia to the start's, or its inverse. The inertias of servo motors of equal
-torque differ by a factor of three to five (catalogues). Without this limit, observers and filters could take
-over the role of the inertia in the fit."""
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 AVERAGE: Final = "moving average"
 FRICTION: Final = "friction feed-forward"
@@ -781,8 +779,6 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     reaction = (REACTION,) if truth.gear.hysteresis else ()
     known = {each: BY_NAME[each] for each in (*MECHANICS, *SERVOS, *reaction)}
     known[DEAD_TIME.name] = replace(DEAD_TIME, most=longest_ms)
-    motor, usual = BY_NAME["motor inertia"], truth.motor.inertia_kg_m2
-    known[motor.name] = replace(motor, least=usual / EQUAL_MOTORS, most=usual * EQUAL_MOTORS)
     averaged_ms = min(cycle_ms, BY_NAME[AVERAGE].most)
     late_ms = max(_lag_ms(truth) - 0.5 * averaged_ms, 2.0 * SHORT_MS)
     plain = _divided(_lag_ms(truth), min(truth.servo.dead_time_ms, longest_ms))
@@ -849,29 +845,11 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
 # Alternative start values, near which the misfit may have other minima.
 
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
-"""Start values of the load's resonance frequency; a fit finds only the nearest minimum."""
+"""Start values of the frequency of the load feed-forward; a fit finds only the nearest minimum."""
+VALLEY_STEPS = (-0.3, 0.3)
+"""Changes of the dead time along the valley of the misfit, in substeps."""
 FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
 """Start values of the fraction of the lag that is due to the command filter."""
-INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
-"""Factors for start values of the motor's inertia, which is visible only just after each new demand."""
-
-
-def elsewhere(best: Fitted, usual: Truth) -> list[Truth]:
-    """Returns alternative start values for a fit; ``usual`` is its start."""
-    truth = best.truth
-    return [*springs(truth), *delays(truth, _most_ms(best)), *feedforwards(truth, usual), *inertias(truth)]
-
-
-def springs(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with each of `FREQUENCIES_HZ` that its time step resolves."""
-    inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
-    found = []
-    for hz in FREQUENCIES_HZ:
-        stiffness = inertia * (math.tau * hz) ** 2
-        damping = truth.gear.damping_nm_s_per_rad * math.sqrt(stiffness / now)
-        if stiffness < 0.9 * truth.highest_stiffness_nm_per_rad:
-            found.append(with_values(truth, {"gear stiffness": stiffness, "gear damping": damping}))
-    return found
 
 
 def lags(truth: Truth) -> list[Truth]:
@@ -893,23 +871,30 @@ def delays(truth: Truth, most_ms: float = DEAD_TIME.most) -> list[Truth]:
     return [_with_dead_time(truth, (each + 0.5) * step_ms) for each in places if each != now]
 
 
-def neighbours(truth: Truth, most_ms: float = DEAD_TIME.most) -> list[Truth]:
-    """Returns those variants of `delays` whose dead time is one substep shorter or longer."""
-    return [each for each in delays(truth, most_ms) if abs(_substep(each) - _substep(truth)) == 1]
+def along_valley(best: Fitted) -> list[Truth]:
+    """Returns variants of a fit with a longer or shorter dead time, in which the other parameters compensate
+    the change as far as the slopes show.
+    """
+    if DEAD_TIME.name not in (names := [each.name for each in best.parameters]):
+        return []
+    number = names.index(DEAD_TIME.name)
+    spread = np.array([each.spread for each in best.parameters])
+    slopes = np.concatenate([best.jacobian * spread, np.eye(len(spread))])
+    others = np.delete(slopes, number, axis=1)
+    moved = np.insert(np.linalg.lstsq(others, -slopes[:, number], rcond=None)[0], number, 1.0)
+    per_ms, step_ms = moved * spread / spread[number], best.truth.substep_ms
+    places = [best.place + step * step_ms * per_ms for step in VALLEY_STEPS]
+    low, high = best.parameters[number].bounds
+    return [
+        at_coordinates(best.truth, best.parameters, each.tolist())
+        for each in places
+        if low <= each[number] <= high
+    ]
 
 
 def _most_ms(best: Fitted) -> float:
     """Returns the upper bound of the dead time in a fit; beyond it, all starts would be the same."""
     return next((each.most for each in best.parameters if each.name == DEAD_TIME.name), DEAD_TIME.most)
-
-
-def inertias(truth: Truth) -> list[Truth]:
-    """Returns variants of the truth with different motor inertias; a spring that is too stiff for an inertia
-    is softened.
-    """
-    motor = [BY_NAME["motor inertia"]]
-    (now,) = coordinates(truth, motor)
-    return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
 
 
 def _substep(truth: Truth) -> int:
@@ -928,8 +913,9 @@ def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
 
 
 def _divided(lag_ms: float, dead_time_ms: float) -> dict[str, float]:
-    """Returns dead time and command filter by parameter name; together they cause this lag."""
-    return {FILTER.name: 0.5 * (lag_ms - dead_time_ms), DEAD_TIME.name: dead_time_ms}
+    """Returns dead time and command filter by parameter name; within their bounds, they cause this lag."""
+    dead_time_ms = min(dead_time_ms, DEAD_TIME.most)
+    return {FILTER.name: min(0.5 * (lag_ms - dead_time_ms), FILTER.most), DEAD_TIME.name: dead_time_ms}
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
@@ -947,16 +933,16 @@ def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
 
 
 def exchanged(truth: Truth) -> Truth:
-    """Returns the truth with position gain and inverse integral time exchanged.
+    """Returns the truth with position gain and inverse integral time exchanged, within their bounds.
 
     In motion both truths have the same loop, because its response depends only on the sum and the product of
     the two. The misfit therefore has two minima.
     """
+    gain, time = BY_NAME["position gain"], BY_NAME["integral time"]
     servo = truth.servo
-    return with_values(
-        truth,
-        {"position gain": 1e3 / servo.integral_time_ms, "integral time": 1e3 / servo.position_gain_per_s},
-    )
+    swapped = {gain.name: 1e3 / servo.integral_time_ms, time.name: 1e3 / servo.position_gain_per_s}
+    within = {each.name: min(max(swapped[each.name], each.least), each.most) for each in (gain, time)}
+    return with_values(truth, within)
 
 
 # ----------------------------------------------------------------
@@ -1125,7 +1111,7 @@ def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -
     def hopeless(fitted: Fitted) -> bool:
         return squares(fitted) > HOPELESS_RATIO
 
-    usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
+    usual = [(each, parameters) for each in (begun, *lags(begun))]
     # Near the noise, `_polished` compares minima.
     best = by_halving(few, usual, noise, keep, near, hopeless, USUAL_STEPS)
     best = replace(best, prior=np.array(coordinates(begun, parameters)))
@@ -1191,7 +1177,8 @@ def _polished(replays: Replays, best: Fitted, begun: Truth, keep: Callable[[Fitt
     keep(best)
     # Wide differences are used for the covariance only, because the servo loops may be unstable near a
     # minimum.
-    return continued(replays, best, 0, near=best, wide=True)
+    wide = continued(replays, best, 0, near=best, wide=True)
+    return replace(wide, covariance=widened(wide, best.visited))
 
 
 def _linearised(replays: Replays, found: Fitted) -> Fitted:
@@ -1200,7 +1187,8 @@ def _linearised(replays: Replays, found: Fitted) -> Fitted:
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
-    """Moves the fit to significantly better minima until none is found, nearby or `elsewhere`.
+    """Moves the fit to significantly better minima until none is found: nearby, or with another dead time or
+    frequency of the load feed-forward.
 
     The fit must be near a minimum, because the alternatives are equally good until the other parameters are
     known.
@@ -1211,37 +1199,53 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth) -> Fitted:
         best = _in_nearby_minimum(replays, best)
         if all(best.scales.deviation[name] <= EXCESS_RATIO * least[name] for name in CHANNELS):
             return best
-        tried = [(each, best.parameters) for each in elsewhere(best, begun)]
-        here, other = (by_halving(few, each, noise) for each in ([(best.truth, best.parameters)], tried))
-        if other.cost + MIN_COST_DECREASE >= here.cost:
+        others = [*delays(best.truth, _most_ms(best)), *feedforwards(best.truth, begun)]
+        if not others:
             return best
-        moved = _moved(replays, best, other.truth)
-        if moved is best:
+        reached = best.place
+        nearest = by_halving(few, [(each, best.parameters) for each in others], noise)
+        best = _moved(replays, best, nearest.truth)
+        if best.place is reached:
             return best
-        best = moved
 
 
 def _in_nearby_minimum(replays: Replays, best: Fitted) -> Fitted:
-    """Moves the fit to the minima with exchanged gains, or with the dead time in the next substep.
+    """Moves the fit to the minima with exchanged gains, or with another dead time.
 
-    They are always tried: exchanged gains differ only at rest, and a dead time in the next substep increases
-    the residuals too little for any channel to show it. A few legs show which of them cannot win.
+    They are always tried: exchanged gains differ only at rest, and another dead time increases the residuals
+    too little for any channel to show it.
     """
     while True:
-        last, few = best, replays.rough
-        here = continued(few, best, MORE_STEPS, linear=False)
-        for place in (exchanged(best.truth), *neighbours(best.truth, _most_ms(best))):
-            other = continued(few, here, MORE_STEPS, place, rival=here.loss, linear=False)
-            if other.loss < here.loss + MIN_LOG_LIKELIHOOD_RATIO:
-                best = _moved(replays, best, place)
-        if best is last:
+        reached = best.place
+        for place in (exchanged(best.truth), *along_valley(best)):
+            best = _moved(replays, best, place)
+        if best.place is reached:
             return best
 
 
 def _moved(replays: Replays, best: Fitted, place: Truth) -> Fitted:
     """Returns the fit from ``place`` if it is significantly better, else ``best``."""
-    other = continued(replays, best, MORE_STEPS, place, rival=best.loss)
-    return _ended(replays, other) if other.loss + MIN_LOG_LIKELIHOOD_RATIO < best.loss else best
+    other = continued(replays, best, MORE_STEPS, place, rival=best.loss, linear=False)
+    if other.loss + MIN_LOG_LIKELIHOOD_RATIO < best.loss:
+        return _ended(replays, other)
+    return replace(best, visited=(*best.visited, (other.place, other.loss)))
+
+
+def widened(fitted: Fitted, visited: Sequence[tuple[FloatArray, float]]) -> FloatArray:
+    """Returns the covariance of a fit, widened to the places that are nearly as likely.
+
+    A motor that breaks away differently in each replay makes the slopes too steep in a flat valley. The
+    square of the distance to a place, in standard deviations, is therefore at most one more than twice the
+    difference between the losses.
+    """
+    covariance = fitted.covariance
+    for place, loss in visited:
+        off = place - fitted.place
+        square = float(off @ np.linalg.solve(covariance, off))
+        most = 1.0 + 2.0 * max(loss - fitted.loss, 0.0)
+        if square > most:
+            covariance = covariance + (1.0 / most - 1.0 / square) * np.outer(off, off)
+    return covariance
 
 
 def _ended(replays: Replays, near: Fitted) -> Fitted:

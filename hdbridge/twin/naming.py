@@ -127,16 +127,20 @@ def explain(
     parameters: Sequence[Parameter],
     was: Mapping[str, Any],
     progress: Callable[[float], None] = lambda _: None,
-    least: float = 0.0,
     shown: Mapping[str, float] | None = None,
+    *,
+    ratio: bool = False,
 ) -> Explained:
     """Names causes until the misfit of ``base`` is back at ``was`` (`scales_by_kind`).
 
     In each round every other cause is fitted together with the named causes. The best is named if it explains
-    at least the fraction `EXPLAINED` of the remaining growth, and the fraction ``least`` of the whole growth.
-    Causes made superfluous by a later one are dropped. A rival of the last cause is a cause that is not
-    significantly worse. ``shown`` contains the factors by which parameters are known to have changed. Their
-    causes are named first if a factor is not 1, and not at all otherwise.
+    at least the fraction `EXPLAINED` of the remaining growth. Causes made superfluous by a later one are
+    dropped. A rival of the last cause is a cause that is not significantly worse. ``shown`` contains the
+    factors by which parameters are known to have changed. Their causes are named first if a factor is not 1,
+    and not at all otherwise.
+
+    With ``ratio``, the values of ``base`` are not the axis's. A named cause then also explains at least the
+    fraction `OF_REPLAY` of the whole growth, and causes whose misfits differ by less than `GROWN` are rivals.
     """
     data, groups = replays.data, by_cause(parameters)
     legs = legs_of_rows(data, fitted_rows(data, everything=True))
@@ -167,12 +171,17 @@ def explain(
             progress((len(named) + len(fits) / len(others)) / (len(named) + 1))
         cause, fit = min(fits.items(), key=lambda each: each[1].cost)
         after = growth(data, fit.residuals, was)
-        if _excess(now) - _excess(after) < max(EXPLAINED * _excess(now), least * _excess(grown)):
+        least = max(EXPLAINED * _excess(now), OF_REPLAY * _excess(grown) if ratio else 0.0)
+        if _excess(now) - _excess(after) < least:
             break
         rivals = tuple(
             each
             for each, other in fits.items()
-            if other is not fit and not worse_than_chance(fit.vector, other.vector - fit.vector, legs)
+            if other is not fit
+            and (
+                not worse_than_chance(fit.vector, other.vector - fit.vector, legs)
+                or (ratio and _similar(after, growth(data, other.residuals, was)))
+            )
         )
         named, best, now = [*named, cause], fit.truth, after
         others.remove(cause)
@@ -205,6 +214,11 @@ def shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
     low, high = parameter.bounds
     (now,) = coordinates(truth, [parameter])
     return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])
+
+
+def _similar(best: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Returns True if no channel's growth is larger than the best by more than the factor `GROWN`."""
+    return all(other[name] <= GROWN * max(times, 1.0) for name, times in best.items())
 
 
 def _excess(grown: Mapping[str, float]) -> float:

@@ -231,7 +231,7 @@ def test_residuals_within_motion_noise_are_explained() -> None:
     ("times_noise", "scatter", "values"),
     [
         (0.9, 1.5, Values.AXIS),
-        (0.9, 9.0, Values.REPLAY),
+        (0.9, 16.0, Values.REPLAY),
         (0.9, math.nan, Values.REPLAY),
         (4.0, 1.5, Values.REPLAY),
     ],
