@@ -34,8 +34,11 @@ class Here:
 
     @contextmanager
     def client(self):
-        options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
-        with LocalCluster(**options) as cluster, Client(cluster, set_as_default=False) as client:
+        options = {"n_workers": 1, "threads_per_worker": 1, "processes": False}
+        with (
+            LocalCluster(**options, dashboard_address="127.0.0.1:0") as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
             yield client
 
 
