@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,6 +37,7 @@ from hdbridge.twin.fit import (
     principal,
     slopes_at,
     solve,
+    widened,
 )
 from hdbridge.twin.misfit import Data, Replays, deviance_residuals, deviation, expected, misfit, prepare
 from hdbridge.twin.parameters import (
@@ -298,6 +301,21 @@ def test_other_parameters_compensate_a_change_of_the_dead_time_along_the_valley(
     assert [each.servo.dead_time_ms < 1.0 for each in valley] == [True, False]
     assert max(changes[:2]) < 0.5 * min(changes[2:])
     assert along_valley(replace(best, parameters=parameters[:1])) == []
+
+
+@given(st.integers(0, 1000), st.lists(st.floats(0.0, 50.0), min_size=1, max_size=4))
+def test_intervals_reach_as_far_as_equally_likely_places(seed: int, losses: list[float]) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((3, 3)) + 3.0 * np.eye(3)
+    fitted: Any = SimpleNamespace(place=np.zeros(3), covariance=root @ root.T, loss=100.0)
+    places = 10.0 * rng.standard_normal((len(losses), 3))
+    visited = [(place, fitted.loss + more) for place, more in zip(places, losses, strict=True)]
+    wide = widened(fitted, visited)
+    assert np.all(np.linalg.eigvalsh(wide - fitted.covariance) > -1e-9)
+    for place, loss in visited:
+        assert place @ np.linalg.solve(wide, place) < 1.0 + 2.0 * (loss - fitted.loss) + 1e-6
+    far = [(place, fitted.loss + 1e6) for place in places]
+    assert np.array_equal(widened(fitted, far), fitted.covariance)
 
 
 SERVO = named("position gain", "integral time", "command filter", "servo dead time", "velocity feed-forward")

@@ -19,6 +19,8 @@ from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, named, with_values
 
 NAMES = ("Coulomb friction", "servo dead time", "command filter")
 ROWS, LEGS = 1200, 24
+QUICK = 0.5
+"""Acceleration that separates dead time and filter significantly, but by less than half the noise."""
 
 
 class Known:
@@ -56,13 +58,15 @@ class Known:
         }
 
 
-def diagnosed(axis: Truth, quick: float) -> tuple[Explained, tuple[InseparableSet, ...]]:
+def diagnosed(
+    axis: Truth, quick: float, *, ratio: bool = False
+) -> tuple[Explained, tuple[InseparableSet, ...]]:
     """Returns the causes by which the axis differs from `TRUTH`, and the sets of inseparable parameters."""
     replays: Any = Known(axis, quick)
     parameters = named(*NAMES)
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
     fitted = solve(replays, TRUTH, parameters, 12, known=Scales(noise))
-    found = explain(replays, TRUTH, parameters, dict.fromkeys(noise, np.ones(ROWS)))
+    found = explain(replays, TRUTH, parameters, dict.fromkeys(noise, np.ones(ROWS)), ratio=ratio)
     return found, inseparable_sets(fitted, legs_of_rows(replays.data, fitted_rows(replays.data)))
 
 
@@ -82,6 +86,16 @@ def test_dead_time_and_filter_are_a_set_if_inseparable() -> None:
     found, sets = diagnosed(with_values(TRUTH, {"servo dead time": 1.5}), quick=0.01)
     assert {*found.causes, *found.rivals} == {"servo dead time", "command filter"}
     assert {"servo dead time", "command filter"} in [set(each.names) for each in sets]
+
+
+@pytest.mark.parametrize(("quick", "rivals"), [(QUICK, ("command filter",)), (50.0, ())])
+def test_small_differences_between_causes_are_no_evidence_for_a_replay(
+    quick: float, rivals: tuple[str, ...]
+) -> None:
+    axis = with_values(TRUTH, {"servo dead time": 1.5})
+    assert diagnosed(axis, quick)[0].rivals == ()
+    found = diagnosed(axis, quick, ratio=True)[0]
+    assert (found.causes, found.rivals) == (("servo dead time",), rivals)
 
 
 LEG_OF_ROW = np.repeat(np.arange(12), 100)
