@@ -136,6 +136,7 @@ def _searched(
         data = without(data, swing)
     soft = swing is not None and swing.soft
     between = between.without(lambda _: soft)
+    data = replace(data, load_swings=bool(between.names) or (swing is not None and not soft))
     search = _search(data, model, scales, between)
     begun = search.begun()
     if not soft:
