@@ -323,6 +323,8 @@ class Observed:
     """Number of reversals of the motor with sufficient travel on both sides, summed over the chains."""
     remarks: tuple[str, ...]
     """Shortcomings of the record, in words."""
+    load_swings: bool = False
+    """True if an ordinary load oscillation has been subtracted, or is fitted with every hypothesis."""
 
     def over(self, runs: IntArray) -> Observed:
         """Returns the same samples averaged over other runs, which are given by their first samples."""

@@ -74,15 +74,20 @@ def test_an_ordinary_load_is_silent(seen) -> None:
     found = seen(45.0)
     assert not found.findings
     assert any("oscillates on its spring at 4" in each for each in found.remarks)
+    assert "ordinary" in found.identifiability["inertial_windup"].reason
 
 
 def test_set_points_joined_by_straight_lines_are_silent(seen) -> None:
     """Each set-point excites the load more than a spline through the samples shows."""
-    assert not seen(65.0, sync=SYNC).findings
+    found = seen(65.0, sync=SYNC)
+    assert not found.findings
+    assert not found.identifiability["inertial_windup"].detectable
 
 
 def test_the_wind_up_of_a_soft_load_is_named_without_its_ringing(seen) -> None:
-    (found,) = seen(28.0).findings
+    result = seen(28.0)
+    assert result.identifiability["inertial_windup"].detectable
+    (found,) = result.findings
     assert found.cause == "inertial_windup"
     stated = found.parameters["inertia_over_stiffness_s2"].value
     assert stated == pytest.approx(1.0 / (math.tau * 28.0) ** 2, rel=0.1)

@@ -307,6 +307,17 @@ def value(value: float, half: float = 0.1) -> dict[str, Any]:
     return {"value": value, "ci95": [value - half, value + half]}
 
 
+def test_friction_of_the_load_is_part_of_the_loop() -> None:
+    """0.4 Nm on 206,265 Nm/rad wind the gear up by 0.4 arcsec, against the direction of motion."""
+    hidden = secret("hysteresis_parameters", offset_arcsec=20.0, width_deg=10.0)
+    truth = {"gear": {"stiffness_nm_per_rad": 206_264.8}, "load": {"coulomb_nm": 0.4}}
+    found = finding("hysteresis_parameters", offset_arcsec=value(19.6), width_deg=value(10.0))
+    compared = verdict({**hidden, "truth": truth}, found).compared
+    assert {each.name: each.true for each in compared} == pytest.approx(
+        {"offset_arcsec": 19.6, "width_deg": 10.0}
+    )
+
+
 def test_motor_order_changes_are_relative_to_the_given_model() -> None:
     hidden = secret("motor_encoder_eccentricity", amplitude_arcsec=2.0, second_arcsec=0.0)
     disc = {"radius_mm": 20.0, "eccentricity_um": 20e3 * 2.0 * 50 / 206264.8, "eccentric_at_deg": 30.0}

@@ -177,6 +177,15 @@ def _velocity(secret: Secret) -> Values:
     return {"coulomb_arcsec": float(dry) / secret.stiffness * ARCSEC_PER_RAD} if dry else {}
 
 
+def _loop(secret: Secret) -> Values:
+    """Returns the parameters of the axis's loop; friction of the load winds it up against the offset."""
+    values = _named(offset_arcsec="offset_arcsec", width_deg="width_deg", exponent="exponent")(secret)
+    dry = secret.load.get("coulomb_nm")
+    if dry and "offset_arcsec" in values:
+        values["offset_arcsec"] -= float(dry) / secret.stiffness * ARCSEC_PER_RAD
+    return values
+
+
 def _loop_height(secret: Secret) -> Values:
     """Returns half the height of the loops of both hysteresis laws together.
 
@@ -292,9 +301,7 @@ TRUE: Mapping[str, Callable[[Secret], Values]] = {
     # The secret states the age of the load's sample, the finding the delay at which it is taken.
     "channel_skew": _scaled(-1.0, delay_ms="delay_ms"),
     "backlash": _named(gap_arcsec="gap_arcsec"),
-    "hysteresis_parameters": _named(
-        offset_arcsec="offset_arcsec", width_deg="width_deg", exponent="exponent"
-    ),
+    "hysteresis_parameters": _loop,
     "hysteresis_memory": _loop_height,
     "rate_dependence": lambda secret: {
         **_scaled(100.0, growth_percent="growth_per_decade")(secret),

@@ -153,6 +153,11 @@ class Observations(Protocol):
         """One count of the motor encoder, referred to the load, arcsec."""
         ...
 
+    @property
+    def load_swings(self) -> bool:
+        """True if the load's oscillation on its spring is ordinary, and not part of the error."""
+        ...
+
 
 class Tracker(ABC):
     """On-line state of an effect.

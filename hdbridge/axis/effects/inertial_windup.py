@@ -4,7 +4,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Angleless, Linear
-from hdbridge.axis.effects.described import Cause, Compensable
+from hdbridge.axis.effects.described import Cause, Compensable, Observations
 from hdbridge.axis.effects.kinematics import acceleration_of
 from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
@@ -45,6 +45,10 @@ class InertialWindup(Angleless, Linear):
     limit_deg_s2: float = Field(
         1e6, gt=0, le=1e8, description="motor acceleration above which the effect is constant"
     )
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires a load that does not oscillate visibly: wind-up is the slow part of the oscillation."""
+        return "it belongs to the load's ordinary oscillation" if observations.load_swings else ""
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the error for J / K = 1 s^2, shape (n, 1)."""
