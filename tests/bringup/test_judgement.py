@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.bringup.checks import Check, Outcome, failed, passed, run_checks
+from hdbridge.commissioning.bringup.checks import Check, Outcome, Verdict, failed, passed, run_checks
 from hdbridge.commissioning.bringup.judge import (
     LOAD_COUNTS,
     MOTOR_COUNTS,
@@ -24,7 +24,7 @@ from hdbridge.commissioning.bringup.judge import (
     suspect_entries,
 )
 from hdbridge.commissioning.bringup.slow import plan_travel
-from hdbridge.errors import DriveError
+from hdbridge.errors import DriveError, SafetyStop
 from hdbridge.files.profile import bundled_profile
 
 ARTICLE = (bundled_profile("article") / "axis.yaml").read_text()
@@ -223,3 +223,20 @@ def test_checks_run_in_order_with_their_prerequisites() -> None:
     rows = run_checks(None, checks, permitted=lambda: asked.append(1) or "no")
     assert [row.verdict.measured for row in rows][3:] == ["no", "no"]
     assert asked == [1]
+
+
+def test_nothing_moves_after_a_safety_stop() -> None:
+    def stopped(_: None) -> Verdict:
+        raise SafetyStop("node 1: TPDO 1 is missing")
+
+    checks = [
+        Check("a", "A", stopped, moves=True),
+        Check("b", "B", lambda _: passed("moved"), moves=True),
+        Check("c", "C", lambda _: passed("read")),
+    ]
+    for permission in (None, "not now"):
+        rows = run_checks(None, checks, permitted=lambda answer=permission: answer)
+        assert "moved" not in [row.verdict.measured for row in rows]
+        assert rows[2].verdict.measured == "read"
+    assert rows[1].verdict.measured == "not now"
+    assert "fault in 'A'" in run_checks(None, checks)[1].verdict.measured

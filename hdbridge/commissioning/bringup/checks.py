@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
-from hdbridge.errors import DriveError, HdbridgeError
+from hdbridge.errors import DriveError, HdbridgeError, SafetyStop
 
 P = TypeVar("P")
 Figure = float | int | str | bool | None
@@ -99,8 +99,8 @@ def run_checks(
 
     A check whose dependencies have not all passed is not run; its outcome is `Outcome.NOT_POSSIBLE`.
     ``permitted`` is called once, before the first check that moves the axis; if it returns a text, no check
-    moves the axis, and the text is given as the reason. A check that raises an `HdbridgeError` has failed;
-    all other exceptions propagate.
+    moves the axis, and the text is given as the reason. After a check that ended in a `SafetyStop`, no other
+    moves the axis either. A check that raises an `HdbridgeError` has failed; all other exceptions propagate.
     """
     rows: list[Row[P]] = []
     outcomes: dict[str, Outcome] = {}
@@ -117,6 +117,8 @@ def run_checks(
                 asked, refusal = True, permitted()
             verdict = not_possible(refusal) if check.moves and refusal else _run(check, subject)
         outcomes[check.name], titles[check.name] = verdict.outcome, check.title
+        if issubclass(verdict.error, SafetyStop):
+            asked, refusal = True, f"the axis stopped at a fault in '{check.title}'; remove it and run again"
         row = Row(check, verdict)
         rows.append(row)
         notify(row)
