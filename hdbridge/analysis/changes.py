@@ -79,12 +79,9 @@ def _finding(
     """Assesses a change like any other cause, by its block-robust evidence and its gain on held-out data.
 
     Both compare the fit with one that keeps the ``given`` part. The evidence is computed from ``loose``, a
-    fit that may contain a free-form loop, unlike a model. Returns None if the change is too small to matter,
-    or the evidence insufficient.
+    fit that may contain a free-form loop, unlike a model. Returns None if the evidence is insufficient.
     """
     estimator, name = search.estimator, change.effect.name
-    if change.peak_arcsec < estimator.floor_arcsec:
-        return None
 
     def as_given(fit: Fitted) -> Fitted:
         now = fit.hypothesis.effects[place]
@@ -136,9 +133,9 @@ def _loop(
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))
     lawless = _lawless_arcsec(estimator, fitted, plain)
-    within = strain(precise, usual, spread) < scales.calibrations**2
+    small = peak < estimator.floor_arcsec or strain(precise, usual, spread) < scales.calibrations**2
     causes = causes_of(given, precise.hypothesis.effects[place])
-    if (within and not lawless) or not causes:
+    if (small and not lawless) or not causes:
         return None
     # A loop that follows neither law exactly may partly follow the alternative law.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
@@ -227,6 +224,8 @@ def _freed(
         return None
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))
+    if peak < estimator.floor_arcsec:
+        return None
     aliases = tuple(search.alternatives_to_change(fitted, place, given))
     return _Change(
         precise.hypothesis.effects[place],

@@ -426,7 +426,7 @@ class _Judge:
         return tuple(dict.fromkeys(names))
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
-        scales, floor = self.estimator.scales, self.estimator.floor_arcsec
+        scales = self.estimator.scales
         many = many_of_one(findings, scales)
         if many is None and not is_unexplained(self.estimator, left):
             return findings
@@ -440,7 +440,7 @@ class _Judge:
             findings = [each for each in findings if each not in many]
         unknown = Finding(
             cause="unexplained",
-            probability=min(1.0 / (1.0 + (floor / max(size, 1e-9)) ** 2), scales.surest),
+            probability=min(1.0 / (1.0 + (scales.floor_arcsec / max(size, 1e-9)) ** 2), scales.surest),
             aliases=(),
             parameters={},
             gain=None,
@@ -457,7 +457,7 @@ class _Judge:
             note = f"the loop's shape follows neither law: {figure(left.arcsec, 3)} arcsec rms remain"
             noted = replace(loops[0], note=note, lives_in=lives)
             return [noted if each is loops[0] else each for each in findings]
-        if many is None and size < scales.unnamed * floor:
+        if size < self.estimator.floor_arcsec:
             return findings
         largest = max((each.explained_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > rms else [unknown, *findings]

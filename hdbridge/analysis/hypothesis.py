@@ -171,10 +171,15 @@ class Estimator:
         return self.scales.rare / max(len(self.data.full), SHORT)
 
     @property
+    def count_arcsec(self) -> float:
+        """One count of the motor encoder, referred to the load, arcsec; 0 if no count is visible."""
+        return self.data.full.count_deg / self.data.ratio * ARCSEC_PER_DEG
+
+    @property
     def floor_arcsec(self) -> float:
-        """Smallest relevant peak: at least half a count of both encoders, which is the peak of rounding."""
-        counts = math.hypot(self.data.motor_count_arcsec, self.data.load_count_arcsec)
-        return max(self.scales.floor_arcsec, 0.5 * counts, 0.5 * self.data.noise_arcsec)
+        """Smallest relevant peak. It includes the rounding of both encoders, which is constant at rest."""
+        rounded = math.hypot(self.count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
+        return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
     def half_span(self, values: FloatArray) -> float:
         """Returns half the peak-to-peak span of values, excluding rare extremes (`rare`)."""

@@ -24,11 +24,7 @@ class Scales:
     enter: float = _scale(
         30.0, "chi square per cause", "2 log of the 3e6 places, shapes and kinds that are searched"
     )
-    floor_arcsec: float = _scale(
-        0.5,
-        "arcsec at its peak",
-        "smaller ones do not matter, nor do those within the rounding of the counts",
-    )
+    floor_arcsec: float = _scale(0.5, "arcsec at its peak", "smaller ones do not matter to an axis")
     rare: float = _scale(
         20.0,
         "samples of 10,000 or more in which an effect exceeds its stated size",
@@ -87,8 +83,7 @@ class Scales:
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", "that cost is itself estimated")
     # Unexplained residual.
-    unnamed: float = _scale(2.0, "times the smallest peak of a cause", "no name says what to do about it")
-    plain_arcsec: float = _scale(1.0, "arcsec", "the same, on an axis without counts and noise")
+    plain_arcsec: float = _scale(1.0, "arcsec", "twice the floor, for a residual without a name")
     near: float = _scale(
         0.4,
         "fraction of the largest piece",

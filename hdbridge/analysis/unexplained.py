@@ -197,14 +197,15 @@ def _seen(
     The remark describes the best view that is too small. It is empty if a view is returned or none passes.
     """
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
+    count_arcsec = estimator.count_arcsec
     gain = scales.enter + scales.penalty
-    largest = 0.0
+    half_steps = 0.5 * _angle_step_arcsec(estimator), 0.5 * estimator.data.load_count_arcsec
+    peak = max(count_arcsec, math.hypot(scales.plain_arcsec, *half_steps))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the law error of an effect grows with its contribution
         contribution = estimator.columns(law, start)[rows] @ law.coefficients()
         gain = max(gain, scales.alias * len(contribution) * float(np.var(weight * contribution)))
-        largest = max(largest, estimator.half_span(contribution))
-    peak = scales.unnamed * estimator.floor_arcsec + math.sqrt(scales.alias) * largest
+        peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(contribution))
     views = sorted((each for each in views if each.gain >= gain), key=lambda each: -each.gain)
     if not views:
         return [], ""
@@ -224,7 +225,7 @@ def _seen(
         return seen, ""
     return [], (
         f"{sizes[0]:.2g} arcsec beyond the noise depend on {views[0].name}, below the threshold for this "
-        f"axis: {peak:.2g} arcsec (a motor count is {estimator.data.motor_count_arcsec:.2g})"
+        f"axis: {peak:.2g} arcsec (a motor count is {count_arcsec:.2g})"
     )
 
 

@@ -94,7 +94,8 @@ def test_the_residual_is_that_of_the_written_model(tmp_path: Path) -> None:
     assert noise["fitted_arcsec"] < 0.5 * rms
     assert held_out["after_arcsec"] == pytest.approx(rms, rel=0.2)
     assert held_out["over"] == "recordings"
-    assert f"residual {noise['residual_arcsec']:.2f} arcsec rms; {noise['fitted_arcsec']:.2f} with" in said
+    assert f"residual of the model, rms of a sample: {noise['residual_arcsec']:.2f} arcsec" in said
+    assert f"with the terms fitted in addition: {noise['fitted_arcsec']:.2f} arcsec" in said
 
 
 def test_a_model_worse_on_held_out_data_is_not_written(tmp_path: Path) -> None:
