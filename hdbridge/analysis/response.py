@@ -274,7 +274,7 @@ def response_of(
         following_lag_ms=round(1000.0 * lag_s, 3),
         known_to_hz=round(known_hz, 2),
         frequency_hz=tuple(round(each.frequency_hz, 3) for each in points),
-        uncertainty=tuple(float(f"{each.uncertainty:.3g}") for each in points),
+        uncertainty=tuple(rounded(each.uncertainty, 3) for each in points),
         filter=_filter(kept, edge_hz, lag_s, cycle_s, per_cycle, limits),
         **_columns("", [each.response for each in points]),
         **_columns("load_", [each.load for each in points]),
@@ -710,8 +710,8 @@ def _filter(
         lead_cycles=LEAD_CYCLES,
         per_cycle=per_cycle,
         full_speed_deg_s=limits.full_speed_deg_s(hertz, np.abs(wanted)),
-        weights=tuple(float(f"{each:.9g}") for each in weights),
-        feedback=tuple(float(f"{each:.9g}") for each in feedback),
+        weights=tuple(rounded(each, 9) for each in weights),
+        feedback=tuple(rounded(each, 9) for each in feedback),
     )
 
 

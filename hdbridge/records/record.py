@@ -28,7 +28,7 @@ from hdbridge.records.columns import (
     option,
     read,
 )
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN, rounded
 
 UNIT_SHARE: Final = 0.006
 """Maximum relative deviation of a slope for attributing it to a wrong unit: the spacing of common ratios."""
@@ -128,9 +128,9 @@ def _round(counts: float, exact: float) -> int:
     if abs(counts / power - 1.0) < exact:
         return power
     for digits in range(1, 8):
-        rounded = float(f"{counts:.{digits}g}")
-        if abs(counts / rounded - 1.0) < exact:
-            return int(rounded)
+        round_counts = rounded(counts, digits)
+        if abs(counts / round_counts - 1.0) < exact:
+            return int(round_counts)
     return round(counts)
 
 

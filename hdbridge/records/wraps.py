@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 
 from hdbridge.axis.effects import FloatArray
 from hdbridge.records.columns import Unit
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN, rounded
 
 LEAST_JUMP_DEG: Final = 900.0 / ARCSEC_PER_DEG
 """Minimum size of a jump, larger than any gear error."""
@@ -97,9 +97,9 @@ def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
     if count and off < 0.5 * count:
         return round(period / count) * count
     for digits in range(1, 13):
-        rounded = float(f"{period:.{digits}g}")
-        if abs(rounded - period) <= off:
-            return rounded
+        round_period = rounded(period, digits)
+        if abs(round_period - period) <= off:
+            return round_period
     return period
 
 

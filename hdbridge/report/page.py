@@ -22,7 +22,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from hdbridge.axis.effects import FloatArray
-from hdbridge.units import FIGURE
+from hdbridge.units import FIGURE, rounded
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
@@ -330,7 +330,7 @@ def _rounded(values: FloatArray) -> list[float | None]:
 
 def _significant(values: FloatArray) -> list[float | None]:
     """Rounds all values to the same relative precision, for logarithmic axes."""
-    return [float(f"{value:.{DIGITS - 1}g}") if math.isfinite(value) else None for value in values.tolist()]
+    return [rounded(value, DIGITS - 1) if math.isfinite(value) else None for value in values.tolist()]
 
 
 def text_of(cell: Cell) -> str:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Final
 
 from hdbridge import __version__
@@ -103,7 +102,8 @@ def scatter_table(tests: Iterable[Stepped], first: str = "with", *, with_article
     rows: list[list[str | float]] = []
     for test in tests:
         parts = (test.pooled, test.cw, test.ccw)
-        rows.append([test.model, *(value for each in parts for value in asdict(each).values())])
+        figures = (value for each in parts for value in (each.three_sigma_arcsec, each.mean_arcsec))
+        rows.append([test.model, *figures])
         if with_article:
             rows[-1] += ARTICLE_TABLE_3.get(test.model, ("", ""))
     caption = ""

@@ -192,7 +192,7 @@ def _roundest(value: float) -> int:
     if abs(power / value - 1.0) <= CLOSE_SHARE:
         return power
     for digits in range(1, 12):
-        tidy = float(f"{value:.{digits - 1}e}")
+        tidy = rounded(value, digits)
         if abs(tidy / value - 1.0) <= CLOSE_SHARE and tidy >= 1.0:
             return round(tidy)
     return max(round(value), 1)

@@ -39,7 +39,7 @@ from hdbridge.errors import InputError
 from hdbridge.motion.procedures.even_speed import SHARES, EvenRun, EvenSpeed
 from hdbridge.motion.procedures.path_test import PathRun, PathTest
 from hdbridge.motion.procedures.rehearsal import total_duration_s
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.units import ARCSEC_PER_DEG, rounded
 
 CHANCE = 1.05
 """Ratio of two ripples, or of two path errors, above which the first counts as larger."""
@@ -396,7 +396,7 @@ class _Runner:
             return None
         limit_deg_s2 = self.axis.limits.acceleration_deg_s2 * self.ratio
         return InertialWindup(
-            ratio=self.ratio, inertia_over_stiffness_s2=float(f"{found_s2:.3g}"), limit_deg_s2=limit_deg_s2
+            ratio=self.ratio, inertia_over_stiffness_s2=rounded(found_s2, 3), limit_deg_s2=limit_deg_s2
         )
 
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
